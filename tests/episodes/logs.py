@@ -10,7 +10,6 @@ import numpy as np
 from tests.helpers import limited, small_world
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.reader import EpisodeReader
-from trackmdp.episodes.schema import TABLES
 from trackmdp.episodes.simulate import simulate
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.policies.policy import Policy
@@ -57,11 +56,11 @@ def write(
 def rewritten(source: Path, target: Path) -> Path:
     """The log read whole and written anew."""
     with EpisodeReader(source) as reader:
-        tables = {name: reader.attachment(name) for name in TABLES}
+        tables = {name: reader.attachment(name) for name in reader.run.tables}
         writer = EpisodeWriter(target, reader.run, tables)
         for number, facts in enumerate(reader.policies):
-            plain = {key: value for key, value in facts.items() if key != "table.sha256"}
-            writer.copy_policy(plain, reader.policy_table(number))
+            plain = {key: value for key, value in facts.items() if not key.startswith("table")}
+            writer.copy_policy(plain, reader.policy_tables(number))
         for episode in reader.episodes():
             writer.add(episode)
     return writer.finish()

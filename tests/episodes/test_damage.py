@@ -30,7 +30,11 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def everything(file: Path) -> tuple[str, list[Episode]]:
     """All that a reader returns; the first as text."""
     with EpisodeReader(file) as reader:
-        tables = [reader.policy_table(number) for number in range(len(reader.policies))]
+        tables = [
+            table
+            for number in range(len(reader.policies))
+            for table in reader.policy_tables(number)
+        ]
         world = reader.world()
         said = [
             reader.run.said,
@@ -39,7 +43,7 @@ def everything(file: Path) -> tuple[str, list[Episode]]:
             reader.policies,
             reader.attachment("config.yaml").decode(),
         ]
-        said += [table.hex() for table in tables if table is not None]
+        said += [table.hex() for table in tables]
         said += [world.kernel.toarray().tobytes().hex(), world.cost.tobytes().hex()]
         return json.dumps(said), list(reader.episodes())
 

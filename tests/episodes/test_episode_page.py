@@ -6,10 +6,12 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import trackmdp as tm
 from tests.episodes.browser import CHROMIUM, Browser
 from tests.episodes.logs import WORLD, recorded, write
 from tests.helpers import train_config
@@ -17,6 +19,7 @@ from tests.tracks import by_hand
 from tests.tracks import recorded as recorded_tracks
 from trackmdp.episodes.episode_page import MOST_STEPS, page
 from trackmdp.episodes.extracts import write_page
+from trackmdp.episodes.group_episode import GroupEpisode
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.simulate import resimulate, simulate
 from trackmdp.errors import UserError
@@ -121,7 +124,9 @@ def test_the_page_in_a_browser(reader: EpisodeReader, tmp_path: Path) -> None:
             # WORLD has 4 columns; x and y of the mark are those of the cell it was last located in before the step
             before = [t for t in range(t) if episode.located[t]]
             last_cell = int(episode.target[before[-1]]) if before else episode.start
-            mark = browser.ask("[located.x, located.y].map((at) => Math.floor(at.baseVal.value))")
+            mark = browser.ask(
+                "[located[0].x, located[0].y].map((at) => Math.floor(at.baseVal.value))"
+            )
             assert mark == [last_cell % 4, last_cell // 4]
             likeliest = int(np.sum(np.rint(1e4 * belief[t]) == np.rint(1e4 * belief[t].max())))
             assert browser.ask("guess.getAttribute('d').split('M').length - 1") == likeliest
@@ -161,6 +166,68 @@ def test_the_page_in_a_browser(reader: EpisodeReader, tmp_path: Path) -> None:
             browser.ask("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
         )
         browser.shoot(tmp_path / "desk.png")
+        assert browser.problems == []
+
+
+def a_page_of(targets: int, tmp_path: Path) -> tuple[GroupEpisode, Path]:
+    """An episode of several targets of 15 steps or more, on a page made by its log and by `page` alike."""
+    world = tm.make_world("random_walk", size=(3, 5), exit_probability=0.05, cost=0.3)
+    found = tm.simulate(tm.Group([world] * targets), "optimal", 30)
+    number = next(k for k, each in enumerate(found) if len(each) >= 15)
+    file = found.page(tmp_path / "a.html", number)
+    (episode,) = [each for each in found.complete() if each.number == number]
+    return episode, file
+
+
+def test_a_page_of_several_targets_holds_each_of_them(tmp_path: Path) -> None:
+    episode, file = a_page_of(3, tmp_path)
+    data: Any = data_of(file.read_text(encoding="utf-8"))
+    assert "3 targets" in data["about"]
+    assert data["reward"] == episode.reward.tolist()
+    assert data["bound"] is None
+    for k, (told, single) in enumerate(zip(data["targets"], episode.singles(), strict=True)):
+        assert told["start"] == episode.start[k]
+        assert told["target"] == np.where(single.target == 15, -1, single.target).tolist()
+        assert told["located"] == single.located.astype(int).tolist()
+        assert single.belief is not None
+        for shares, belief in zip(told["belief"], single.belief, strict=True):
+            whole = np.zeros(15)
+            whole[shares[::2]] = shares[1::2]
+            assert whole == pytest.approx(1e4 * belief, abs=0.5)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+@pytest.mark.parametrize("targets", [3, 6])
+def test_several_targets_in_a_browser(targets: int, tmp_path: Path) -> None:
+    episode, file = a_page_of(targets, tmp_path)
+    with Browser(tmp_path / "profile") as browser:
+        browser.view(360, 740, "dark")
+        browser.open(file)
+        for t in range(len(episode)):
+            inside = episode.target[t] < 15
+            shown = browser.ask("target.map((each) => each.style.display === '')")
+            assert shown == inside.tolist()
+            at = browser.ask(
+                "target.map((e) => [e.getAttribute('cx'), e.getAttribute('cy'), e.getAttribute('class')])"
+            )
+            numbers = browser.ask("names.map((each) => each.textContent)")
+            assert numbers == [str(k) for k in range(targets)]
+            for k in np.flatnonzero(inside):
+                row, column = divmod(int(episode.target[t, k]), 5)
+                kind = "target" if episode.located[t, k] else "missed"
+                assert at[k] == [str(column + 0.5), str(row + 0.5), kind]
+            colours = browser.ask("target.map((each) => each.style.getPropertyValue('--target'))")
+            assert len(set(colours)) == targets
+            said = browser.ask("document.getElementById('said').textContent")
+            if targets > 4:
+                assert f"{episode.located[t].sum()} of {targets} targets located" in said
+            else:
+                assert said.count("has left") == int((~inside).sum())
+            browser.press("ArrowRight")
+        assert browser.ask("document.documentElement.scrollWidth") <= 360
+        assert browser.smallest_letters() >= 11
+        shown = browser.ask("document.body.innerText")
+        assert "expected here" in shown and "the bound on" not in shown
         assert browser.problems == []
 
 

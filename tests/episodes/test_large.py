@@ -111,7 +111,9 @@ def test_the_part_that_a_browser_draws(folder: Path, tmp_path: Path) -> None:
             if episode.target[t] < 3000:
                 row, column = divmod(int(episode.target[t]), 50)
                 assert x < column < x + width and y < row < y + height
-                assert browser.ask("[target.cx, target.cy].map((at) => at.baseVal.value)") == [
+                assert browser.ask(
+                    "[target[0].cx, target[0].cy].map((at) => at.baseVal.value)"
+                ) == [
                     column + 0.5,
                     row + 0.5,
                 ]
@@ -138,6 +140,8 @@ def test_a_small_grid_is_drawn_whole() -> None:
         "belief": None,
         "action": np.zeros((1, 16), bool),
         "target": np.array([5]),
+        "start": 5,
+        "terminated": False,
     }.items():
         object.__setattr__(episode, name, value)
     object.__setattr__(episode, "located", np.array([True]))

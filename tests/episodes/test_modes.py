@@ -15,9 +15,9 @@ import pytest
 from tests.typed import refused
 from trackmdp.app.cli import main
 from trackmdp.episodes.episode import Episode, first_difference
-from trackmdp.episodes.player import mode_words
 from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
+from trackmdp.episodes.sentences import mode_words
 from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy

@@ -16,12 +16,15 @@ import pytest
 from mcap.reader import make_reader
 
 from tests.episodes.logs import policy, recorded, write
+from tests.episodes.test_group_log import played
+from tests.episodes.test_group_log import write as write_several
 from tests.helpers import limited
 from trackmdp.episodes import grids
 from trackmdp.episodes.episode import first_difference
-from trackmdp.episodes.grids import WHOLE_CELLS, layout
+from trackmdp.episodes.grids import WHOLE_CELLS
+from trackmdp.episodes.layouts import layout
 from trackmdp.episodes.reader import EpisodeReader
-from trackmdp.episodes.schema import SCHEMAS
+from trackmdp.episodes.schema import SCHEMAS, schemas_of_several
 from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy
 from trackmdp.world.kernels import random_walk
@@ -32,7 +35,7 @@ pytest.importorskip("foxglove", reason="needs the package foxglove-sdk")
 pytest.importorskip("google.protobuf", reason="needs the package protobuf")
 
 import foxglove.layouts as fl
-from foxglove.messages import Grid
+from foxglove.messages import Grid, SceneUpdate
 from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory
 
 WALK = World(
@@ -63,10 +66,7 @@ LAYERS = ("/grid", "/active", "/target")
 
 def drawn(said: dict[str, Any], size: tuple[int, int]) -> dict[str, np.ndarray]:
     """Field -> what a viewer draws in each of our cells; Foxglove's class refuses unknown keys and other types."""
-    time = said["timestamp"]
-    # protobuf's own JSON writes times as text, Foxglove's as seconds and nanoseconds.
-    stamp = datetime.fromtimestamp(time["sec"], UTC).strftime("%Y-%m-%dT%H:%M:%S")
-    made = json_format.ParseDict(said | {"timestamp": f"{stamp}.{time['nsec']:09}Z"}, published()())
+    made = parsed(said, Grid, "foxglove.Grid")
     rows, columns, side = len(made.data) // made.row_stride, made.column_count, made.cell_size.x
     assert (made.row_stride, made.cell_size.y) == (columns * made.cell_stride, side)
     kinds = {1: np.dtype("u1"), 7: np.dtype("<f4")}  # foxglove.NumericType
@@ -91,13 +91,26 @@ def drawn(said: dict[str, Any], size: tuple[int, int]) -> dict[str, np.ndarray]:
     return {name: whole.ravel() for name, whole in found.items()}
 
 
-def published() -> Any:
-    """Foxglove's own class of a `foxglove.Grid`."""
-    files = descriptor_pb2.FileDescriptorSet.FromString(Grid.get_schema().data)
+def parsed(said: dict[str, Any], kind: Any, name: str) -> Any:
+    """A message as Foxglove's own class of it."""
+    files = descriptor_pb2.FileDescriptorSet.FromString(kind.get_schema().data)
     pool = descriptor_pool.DescriptorPool()
     for file in files.file:
         pool.Add(file)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName("foxglove.Grid"))
+    made = message_factory.GetMessageClass(pool.FindMessageTypeByName(name))()
+    return json_format.ParseDict(with_times(said), made)
+
+
+def with_times(said: Any) -> Any:
+    """Times as text, as protobuf's own JSON has them; Foxglove's has seconds and nanoseconds."""
+    if isinstance(said, list):
+        return [with_times(each) for each in said]
+    if not isinstance(said, dict):
+        return said
+    if said.keys() == {"sec", "nsec"}:
+        stamp = datetime.fromtimestamp(said["sec"], UTC).strftime("%Y-%m-%dT%H:%M:%S")
+        return f"{stamp}.{said['nsec']:09}Z"
+    return {key: with_times(each) for key, each in said.items()}
 
 
 @pytest.mark.parametrize("whole_cells", [WHOLE_CELLS, 9])
@@ -166,6 +179,68 @@ def test_a_grid_that_lies_outside_is_damage(place: dict[str, Any]) -> None:
     for wrong in every[:2]:
         with pytest.raises((ValueError, TypeError)):
             grids.read_grids([json.dumps(wrong).encode()], WALK.size)
+
+
+SEVERAL = schemas_of_several(3)
+
+
+@pytest.fixture(scope="module")
+def group_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_several(tmp_path_factory.mktemp("log") / "several.mcap", played(5))
+
+
+@pytest.mark.parametrize("topic", SEVERAL)
+def test_every_message_of_several_targets_is_what_its_schema_says(
+    group_log: Path, topic: str
+) -> None:
+    found = messages(group_log, topic)
+    assert found
+    for said in found:
+        check_json(said, SEVERAL[topic][1], topic)
+
+
+def test_several_targets_are_drawn_as_they_were_logged(group_log: Path) -> None:
+    """Each belief, their sum, the sensors, and a disc with its number for each target in the grid."""
+    topics = ("/grid", "/belief/0", "/belief/1", "/belief/2", "/active", "/targets")
+    every = [messages(group_log, topic) for topic in topics]
+    steps = [(episode, t) for episode in played(5) for t in range(len(episode))]
+    for (episode, t), whole, *each, active, scene in zip(steps, *every, strict=True):
+        shown = [drawn(said, (1, 3))["belief"] for said in each]
+        assert episode.belief is not None
+        assert np.array_equal(shown, episode.belief[3 * t : 3 * t + 3].toarray())
+        assert drawn(whole, (1, 3))["belief"] == pytest.approx(sum(shown))
+        assert np.array_equal(drawn(active, (1, 3))["active"], episode.action[t])
+        made = parsed(scene, SceneUpdate, "foxglove.SceneUpdate")
+        assert [each.type for each in made.deletions] == [1]  # all of the step before
+        inside = np.flatnonzero(episode.target[t] < 3)
+        assert [entity.texts[0].text for entity in made.entities] == [str(k) for k in inside]
+        for k, entity in zip(inside, made.entities, strict=True):
+            assert entity.id == f"target {k}"
+            place = entity.cylinders[0].pose.position
+            assert (place.x, place.y) == (episode.target[t, k] + 0.5, 0.5)
+            assert (entity.cylinders[0].color.a == 1) == episode.located[t, k]
+        colours = {str(entity.cylinders[0].color) for entity in made.entities}
+        assert len(colours) == len(inside) or not episode.located[t].all()
+
+
+@pytest.mark.parametrize("targets", [2, 50])
+def test_a_layout_of_several_targets_is_one_of_foxgloves(targets: int, group_log: Path) -> None:
+    made = layout((4, 6), targets)
+    for name, config in made["configById"].items():
+        for viewer in ("foxglove", "lichtblick"):
+            assert config.pop(f"{viewer}PanelTitle")
+        check(config, PANELS[name.split("!")[0]], name)
+    shown = re.findall(r'"([^"]+![^"]+)"', json.dumps(made["layout"]))
+    assert sorted(shown) == sorted(made["configById"])
+    for topic, key in re.findall(r'"(/[a-z]+)\.([a-z_]+)', json.dumps(made)):
+        assert key in messages(group_log, topic)[0]
+    topics = made["configById"]["3D!belief"]["topics"]
+    assert [topic for topic, each in topics.items() if each["visible"]] == [
+        "/grid",
+        "/active",
+        "/targets",
+    ]
+    assert made["configById"]["3D!belief"]["cameraState"]["distance"] == pytest.approx(1.2 * 6)
 
 
 @pytest.mark.parametrize("topic", SCHEMAS)

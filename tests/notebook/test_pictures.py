@@ -12,6 +12,7 @@ import pytest
 
 import trackmdp as tm
 from tests.notebook.objects import NAMES, objects, recorded
+from trackmdp.episodes.target_colours import shares_of
 from trackmdp.errors import UserError
 from trackmdp.notebook import drawing
 from trackmdp.notebook.pictures import Heat, Lines, picture_of
@@ -136,6 +137,19 @@ def test_an_episode_is_written_as_a_video(ending: str, tmp_path: Any) -> None:
 
         frames, _ = imageio_ffmpeg.count_frames_and_secs(str(file))
         assert frames == len(episodes[short])
+
+
+def test_several_targets_are_a_video_in_colours_of_their_own(tmp_path: Any) -> None:
+    pytest.importorskip("matplotlib")
+    image = pytest.importorskip("PIL.Image")
+    world = tm.make_world("random_walk", size=3, exit_probability=0.2, cost=0.3)
+    episodes = tm.simulate(tm.Group([world] * 3), "all_on", 4)
+    with image.open(episodes.video(tmp_path / "a.gif", 1)) as shown:
+        assert shown.n_frames == len(episodes[1])
+        pixels = {colour for _, colour in shown.convert("RGB").getcolors(2**20)}
+    wanted = [tuple(round(255 * share) for share in shares_of(k)) for k in range(3)]
+    near = [min(max(abs(a - b) for a, b in zip(c, w, strict=True)) for c in pixels) for w in wanted]
+    assert max(near) < 80  # a .gif has few colours; grey and white are farther from all of them
 
 
 def test_a_video_that_cannot_be_written_is_one_line(tmp_path: Any) -> None:

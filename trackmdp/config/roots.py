@@ -136,19 +136,17 @@ class EvaluateConfig(WorldConfig):
             given = "neither" if self.run is None else "both"
             raise UserError(f"expected exactly one of run=FOLDER and baseline=NAME, got {given}")
         if self.targets.count > 1:
-            # An episode in a log is of one target, and plans that draw have no belief to merge.
+            # Plans that draw have no belief to merge.
             several = f"with targets.count={self.targets.count}"
-            if self.log:
-                raise refuse("log", listed(self.log), f"[] {several}")
             if self.baseline is not None and self.baseline.name in ("playback", "random_k"):
                 raise refuse("baseline", self.baseline.name, f"one that does not draw {several}")
         if not all(node.episodes_only for node in self.log.values()):
             raise refuse("log", listed(self.log), "[mcap] or []; an evaluation has no iterations")
 
     def ignored(self, root: Any) -> dict[str, str]:
-        """Of several targets as many episodes are simulated as `evaluation.width` asks for."""
-        why = f"with targets.count={self.targets.count}, where evaluation.width is met"
-        return {"episodes": why} if self.targets.count > 1 else {}
+        """Of several targets as many episodes are simulated as `evaluation.width` asks for, and logged as are named."""
+        why = f"with targets.count={self.targets.count} and no log, where evaluation.width is met"
+        return {"episodes": why} if self.targets.count > 1 and not self.log else {}
 
 
 class CompareConfig(WorldConfig):

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, TypeAlias, cast, overload
 
 import numpy as np
@@ -16,11 +15,10 @@ import numpy.typing as npt
 import torch
 from tensordict import TensorDict
 
-from trackmdp.durable import write_text
 from trackmdp.episodes.belief_filter import beliefs
 from trackmdp.episodes.episode import Episode, Floats, Integers, last_cells
-from trackmdp.errors import UserError
-from trackmdp.notebook.card import Card, Carded, decimal, grid_words, percent
+from trackmdp.episodes.showing import Showing
+from trackmdp.notebook.card import Card, decimal, grid_words, percent
 from trackmdp.policies.policy import Policy
 from trackmdp.world.model import Array, BoolArray
 from trackmdp.world.tracks import Problem
@@ -56,7 +54,7 @@ class Simulation:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Episodes(Carded, Sequence[Episode]):
+class Episodes(Showing, Sequence[Episode]):
     """The episodes of one policy, all their steps end to end; a sequence of `Episode`.
 
     Attributes:
@@ -237,33 +235,9 @@ class Episodes(Carded, Sequence[Episode]):
         ]
         return cast(TensorDict, torch.cat(parts)) if parts else TensorDict({}, [0])
 
-    def page(self, file: str | Path, number: int = 0) -> Path:
-        """Write an episode as a web page that needs no network, and return its path.
-
-        Raises:
-            UserError: there is no such episode.
-        """
-        from trackmdp.episodes.episode_page import page
-
-        place = Path(file)
-        write_text(place, page(self.problem, self._shown("page", number)))
-        return place
-
-    def video(self, file: str | Path, number: int = 0, *, speed: int = 4) -> Path:
-        """Write an episode as a `.gif` or `.mp4` of `speed` steps per second, and return its path (extra `video`).
-
-        Raises:
-            UserError: there is no such episode, another ending, or a package is missing.
-        """
-        from trackmdp.episodes.video import write_video
-
-        write_video(Path(file), self.problem, self._shown("video", number), speed)
-        return Path(file)
-
-    def _shown(self, call: str, number: int) -> Episode:
-        """An episode with its belief."""
-        if not 0 <= number < len(self):
-            raise UserError(f"{call}: episode {number}, expected 0 to {len(self) - 1}")
+    def shown(self, call: str, number: int) -> Episode:
+        """See `Showing`."""
+        self.check(call, number)
         (episode,) = self._completed([self[number]])
         return episode
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeAlias
@@ -19,8 +20,63 @@ Floats: TypeAlias = npt.NDArray[np.float32]
 Integers: TypeAlias = npt.NDArray[np.int64]
 
 
+class Recording(Carded):
+    """What episodes of one target and of several have in common; see `Episode`.
+
+    Attributes:
+        first_tick: place of its first step on the log's time line; None until it is logged.
+    """
+
+    number: int
+    seed: int
+    policy: int
+    start: Any
+    misses: Integers
+    action: BoolArray
+    target: Integers
+    located: BoolArray
+    reward: Floats
+    terminated: bool
+    truncated: bool
+    mode: Integers | None = None
+    first_tick: int | None = None
+
+    def __len__(self) -> int:
+        return len(self.target)
+
+    @cached_property
+    def observation(self) -> Integers:
+        """`[T]` the cell in which the target was located by the step, -1 if in none; of K targets `[T, K]`."""
+        return np.where(self.located, self.target, -1)
+
+    @cached_property
+    def returns(self) -> npt.NDArray[np.float64]:
+        """`[T]` reward summed up to and with the step."""
+        return np.cumsum(self.reward, dtype=np.float64)
+
+    def forced(self, t_max: int) -> BoolArray:
+        """`[T]` whether the safe action replaced the chosen one."""
+        late = self.misses > t_max
+        found: BoolArray = late if late.ndim == 1 else np.any(late, axis=1)
+        found[-1] &= not self.terminated  # the last step is the exit's
+        return found
+
+    @property
+    def complete(self) -> bool:
+        """Whether beliefs, and of one target probabilities, were asked for."""
+        raise NotImplementedError
+
+    def singles(self) -> Iterator[Episode]:
+        """An episode for each target, with the sensors and the reward of all."""
+        raise NotImplementedError
+
+    def expected(self, t: int, cells: int) -> npt.NDArray[np.floating[Any]]:
+        """`[M]` how many targets were expected in each cell at step `t`; 0 where beliefs were not asked for."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Episode(Carded):
+class Episode(Recording):
     """T steps of one target. Row t is step t: state and action before the move, outcome after it.
 
     Attributes:
@@ -58,10 +114,6 @@ class Episode(Carded):
     mode: Integers | None = None
     start_mode: int = 0
     first_tick: int | None = field(default=None)
-    """Place of its first step on the log's time line; None until it is logged."""
-
-    def __len__(self) -> int:
-        return len(self.target)
 
     def card(self) -> Card:
         """Length, return, detections and end."""
@@ -77,21 +129,18 @@ class Episode(Carded):
         """`[T]` cell of the last detection before the step, x_{l(k)}."""
         return last_cells(self.start, self.target, self.located)[:-1]
 
-    @cached_property
-    def observation(self) -> Integers:
-        """`[T]` the cell in which the target was located by the step, -1 if in none."""
-        return np.where(self.located, self.target, -1)
+    @property
+    def complete(self) -> bool:
+        """See `Recording`."""
+        return self.belief is not None and self.probability is not None
 
-    @cached_property
-    def returns(self) -> npt.NDArray[np.float64]:
-        """`[T]` reward summed up to and with the step."""
-        return np.cumsum(self.reward, dtype=np.float64)
+    def singles(self) -> Iterator[Episode]:
+        """See `Recording`."""
+        yield self
 
-    def forced(self, t_max: int) -> BoolArray:
-        """`[T]` whether the safe action replaced the chosen one."""
-        found = self.misses > t_max
-        found[-1] &= not self.terminated  # the last step is the exit's
-        return found
+    def expected(self, t: int, cells: int) -> npt.NDArray[np.floating[Any]]:
+        """See `Recording`."""
+        return np.zeros(cells) if self.belief is None else self.belief[t]
 
     def to_tensordict(self, task: Task) -> TensorDict:
         """`[T]` steps under the keys of `TrackEnv`, as a rollout has them: the outcome of each step under `next`.
@@ -118,11 +167,11 @@ class Episode(Carded):
         if task.max_steps:
             states["step_count"] = np.arange(len(self) + 1)
         current = {key: value[:-1] for key, value in states.items()}
-        current |= {"action": action, **_ends(len(self), terminated=False, truncated=False)}
+        current |= {"action": action, **ends(len(self), terminated=False, truncated=False)}
         following = {key: value[1:] for key, value in states.items()}
         following |= {
             "reward": self.reward[:, None],
-            **_ends(len(self), self.terminated, self.truncated),
+            **ends(len(self), self.terminated, self.truncated),
         }
         return TensorDict({**current, "next": following}, [len(self)])
 
@@ -154,7 +203,8 @@ def last_cells(start: int, target: Integers, located: BoolArray) -> Integers:
     return np.where(latest < 0, start, target[latest])
 
 
-def _ends(steps: int, terminated: bool, truncated: bool) -> dict[str, Any]:
+def ends(steps: int, terminated: bool, truncated: bool) -> dict[str, Any]:
+    """The flags `done`, `terminated` and `truncated` `[T, 1]` of an episode of T steps."""
     flags = {name: np.zeros((steps, 1), dtype=bool) for name in ("done", "terminated", "truncated")}
     for name, value in (
         ("terminated", terminated),
@@ -170,7 +220,7 @@ PER_STEP = ("target", "mode", "misses", "action", "located", "reward", "probabil
 
 
 def first_difference(
-    logged: Episode, again: Episode, *, belief_tolerance: float = 0.0
+    logged: Recording, again: Recording, *, belief_tolerance: float = 0.0
 ) -> str | None:
     """Where two recordings of an episode part, in words; None where every bit is the same.
 
@@ -179,6 +229,15 @@ def first_difference(
         again: the other.
         belief_tolerance: differences of the belief up to this one pass.
     """
+    pairs = enumerate(zip(logged.singles(), again.singles(), strict=True))
+    found = {k: _first(mine, other, belief_tolerance) for k, (mine, other) in pairs}
+    several = len(found) > 1
+    said = (f"target {k}, {each}" if several else each for k, each in found.items() if each)
+    return next(said, None)
+
+
+def _first(logged: Episode, again: Episode, belief_tolerance: float) -> str | None:
+    """See `first_difference`; of one target."""
     for name in SCALARS:
         mine, other = getattr(logged, name), getattr(again, name)
         if mine != other:

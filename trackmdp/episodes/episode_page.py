@@ -9,9 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from trackmdp.episodes.episode import Episode
+from trackmdp.episodes.episode import Episode, Recording
+from trackmdp.episodes.target_colours import COLOURS
 from trackmdp.solvers import bounds
-from trackmdp.world.tracks import Problem
+from trackmdp.world.group import Group
+from trackmdp.world.model import Task
+from trackmdp.world.tracks import Problem, Recorded
 
 MOST_STEPS = 2000
 """Steps on a page; a longer episode is cut there, with a note on the page."""
@@ -23,7 +26,7 @@ _MOST_CELLS = 100
 """Shaded cells of a step, the likeliest."""
 
 
-def page(problem: Problem, episode: Episode, label: str = "", seed: str = "") -> str:
+def page(problem: Problem | Group, episode: Recording, label: str = "", seed: str = "") -> str:
     """The page as text.
 
     Args:
@@ -40,48 +43,69 @@ def page(problem: Problem, episode: Episode, label: str = "", seed: str = "") ->
     return template.replace("@TITLE@", title).replace("@DATA@", text.replace("<", "\\u003c"))
 
 
-def _about(problem: Problem, episode: Episode, seed: str) -> str:
+def _about(problem: Problem | Group, episode: Recording, seed: str) -> str:
     """The line under the title."""
-    about = [f"{problem.rows} x {problem.columns} grid, {len(episode)} steps"]
-    if problem.model is None:
+    rows, columns = problem.task.size
+    about = [f"{rows} x {columns} grid, {len(episode)} steps"]
+    if isinstance(problem, Recorded):
         about[0] += " along a held-out track"
+    if isinstance(problem, Group):
+        about[0] += f", {len(problem)} targets"
     about[0] += f", seed {seed}" if seed else ""
     if len(episode) > MOST_STEPS:
         about.append(f"the first {MOST_STEPS:,} steps are shown")
-    if max(problem.size) > PAGE_WIDE:
-        size = f"{min(problem.rows, PAGE_WIDE)} x {min(problem.columns, PAGE_WIDE)} cells"
-        about.append(f"of the grid, the {size} around the target")
+    if max(rows, columns) > PAGE_WIDE:
+        size = f"{min(rows, PAGE_WIDE)} x {min(columns, PAGE_WIDE)} cells"
+        about.append(f"of the grid, the {size} around the target{'s' * isinstance(problem, Group)}")
     return "; ".join(about)
 
 
-def _bound(problem: Problem, start: int) -> float | None:
-    """The clocked bound of a start cell; None without a motion model."""
-    world = problem.model
-    return None if world is None else float(bounds.clocked(world)[start])
+def _content(problem: Problem | Group, episode: Recording) -> dict[str, Any]:
+    """The data of the page: of one target all at once, of several a part for each under `targets`."""
+    shown, task = slice(0, MOST_STEPS), problem.task
+    targets = [_of_target(single, task) for single in episode.singles()]
+    own = {"targets": targets, "colours": COLOURS} if isinstance(problem, Group) else targets[0]
+    return (
+        own
+        | _of_world(problem, episode)
+        | {
+            "rows": task.rows,
+            "columns": task.columns,
+            "wide": PAGE_WIDE,
+            "forced": episode.forced(task.t_max)[shown].astype(int).tolist(),
+            "reward": episode.reward[shown].tolist(),
+            "total": episode.returns[shown].tolist(),
+            "on": episode.action[shown].sum(axis=1).tolist(),
+            "sensed": [row.nonzero()[0].tolist() for row in task.covered(episode.action[shown])],
+            "frame": "sensor on" if task.coverage is None else "cell sensed",
+        }
+    )
 
 
-def _content(problem: Problem, episode: Episode) -> dict[str, Any]:
+def _of_world(problem: Problem | Group, episode: Recording) -> dict[str, Any]:
+    """The clocked bound of the start cell, None without a motion model or of several targets; modes where there are."""
+    world = None if isinstance(problem, Group) else problem.model
+    if world is None:
+        return {"bound": None}
+    found: dict[str, Any] = {"bound": float(bounds.clocked(world)[episode.start])}
+    if episode.mode is not None:
+        found |= {
+            "mode": episode.mode[:MOST_STEPS].tolist(),
+            "drift": world.drift.round(3).tolist(),
+        }
+    return found
+
+
+def _of_target(episode: Episode, task: Task) -> dict[str, Any]:
+    """Where a target was, and where it was expected."""
     shown = slice(0, MOST_STEPS)
-    target = np.where(episode.target == problem.num_cells, -1, episode.target)
+    target = np.where(episode.target == task.num_cells, -1, episode.target)
     assert episode.belief is not None  # a logged episode has it
-    modes = {}
-    if (world := problem.model) and episode.mode is not None:
-        modes = {"mode": episode.mode[shown].tolist(), "drift": world.drift.round(3).tolist()}
-    return modes | {
-        "rows": problem.rows,
-        "columns": problem.columns,
-        "wide": PAGE_WIDE,
-        "bound": _bound(problem, episode.start),
+    return {
         "start": int(episode.start),
         "target": target[shown].tolist(),
         "located": episode.located[shown].astype(int).tolist(),
-        "forced": episode.forced(problem.t_max)[shown].astype(int).tolist(),
         "n": episode.misses[shown].tolist(),
-        "reward": episode.reward[shown].tolist(),
-        "total": episode.returns[shown].tolist(),
-        "on": episode.action[shown].sum(axis=1).tolist(),
-        "sensed": [row.nonzero()[0].tolist() for row in problem.covered(episode.action[shown])],
-        "frame": "sensor on" if problem.coverage is None else "cell sensed",
         "belief": [_sparse(row) for row in episode.belief[shown]],
     }
 

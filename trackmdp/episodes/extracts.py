@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from trackmdp.durable import write_text
 from trackmdp.episodes.episode_page import page
-from trackmdp.episodes.messages import step_messages
 from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.written import form_of
 
 
 def write_page(reader: EpisodeReader, file: Path, number: int | None = None) -> None:
@@ -25,37 +27,33 @@ def write_page(reader: EpisodeReader, file: Path, number: int | None = None) -> 
     write_text(file, page(reader.world(), episode, label, str(reader.run.said.get("seed", ""))))
 
 
-_STEP = (
-    "episode",
-    "t",
-    "n",
-    "last_cell",
-    "active",
-    "n_active",
-    "forced",
-    "target",
-    "obs",
-    "reward",
-    "ep_return",
-)
+_LEFT_OUT = {"target_x", "target_y", "first", "last"}
+"""Of the steps: what follows from the other columns."""
 
 
 def write_tables(reader: EpisodeReader, folder: Path, number: int | None = None) -> None:
     """Write `steps.csv` and `episodes.csv` of all episodes, or of one.
 
-    Cells are numbers, -1 for none; `active` holds the numbers of the sensors on, separated by blanks.
+    Cells are numbers, -1 for none; `active` holds the numbers of the sensors on, and a column of several targets a
+    number of each, separated by blanks.
     """
     rows = [reader.row(number)] if number is not None else reader.rows
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "steps.csv").open("w", newline="", encoding="utf-8") as stream:
-        columns = [*_STEP, "mode"] if reader.run.modes else _STEP
+    form, fields = form_of(reader.run), reader.run.schemas["/step"][1]["properties"]
+    steps = (
+        json.loads(message) for row in rows for message in form.steps(reader.read(row["episode"]))
+    )
+    _write(folder / "steps.csv", [name for name in fields if name not in _LEFT_OUT], steps)
+    _write(folder / "episodes.csv", list(reader.rows[0]) if reader.rows else ["episode"], rows)
+
+
+def _write(file: Path, columns: list[str], rows: Iterable[dict[str, Any]]) -> None:
+    with file.open("w", newline="", encoding="utf-8") as stream:
         table = csv.DictWriter(stream, columns, extrasaction="ignore")
         table.writeheader()
         for row in rows:
-            for message in step_messages(reader.read(row["episode"]), reader.run):
-                step = json.loads(message)
-                table.writerow(step | {"active": " ".join(map(str, step["active"]))})
-    with (folder / "episodes.csv").open("w", newline="", encoding="utf-8") as stream:
-        table = csv.DictWriter(stream, list(reader.rows[0]) if reader.rows else ["episode"])
-        table.writeheader()
-        table.writerows(rows)
+            table.writerow({name: _listed(value) for name, value in row.items()})
+
+
+def _listed(value: Any) -> Any:
+    return " ".join(map(str, value)) if isinstance(value, list) else value

@@ -12,7 +12,8 @@ from typing import Any
 from trackmdp.config import McapConfig
 from trackmdp.config.tree import config_text
 from trackmdp.episodes.batch import Episodes
-from trackmdp.episodes.grids import write_layout
+from trackmdp.episodes.group_episodes import GroupEpisodes
+from trackmdp.episodes.layouts import write_layout
 from trackmdp.episodes.recover import taken_over
 from trackmdp.episodes.simulate import simulate
 from trackmdp.episodes.writer import EpisodeWriter
@@ -20,6 +21,7 @@ from trackmdp.policies.policy import Policy, PolicyLike
 from trackmdp.training.callbacks import Callback, Training
 from trackmdp.training.evaluator import Score
 from trackmdp.untrusted import reason
+from trackmdp.world.group import Group
 from trackmdp.world.tracks import Problem
 
 
@@ -43,7 +45,7 @@ class EpisodeLog:
     def __init__(
         self,
         folder: Path,
-        world: Problem,
+        world: Problem | Group,
         *,
         seed: int,
         config: str,
@@ -62,7 +64,7 @@ class EpisodeLog:
                 facts = {"seed": str(seed)}
                 self._writer = EpisodeWriter.of(self.file, world, facts=facts, config=config)
             if layout:
-                write_layout(folder / "episodes.layout.json", world.size)
+                write_layout(folder / "episodes.layout.json", self._writer.run)
 
     def _take_over(self, policies: int) -> None:
         """Resume the log of an earlier process, which was killed (`.part`) or ended in order."""
@@ -94,13 +96,13 @@ class EpisodeLog:
                 made = simulate(self._world, policy, episodes, seed=self._seed, names=names)
                 self._add(made, facts)
 
-    def add(self, episodes: Episodes, facts: Mapping[str, str]) -> None:
+    def add(self, episodes: Episodes | GroupEpisodes, facts: Mapping[str, str]) -> None:
         """Log simulated episodes; `facts` describes their policy in the log, such as its `label`."""
         if self._writer is not None:
             with self._over_at_failure():
                 self._add(episodes, facts)
 
-    def _add(self, episodes: Episodes, facts: Mapping[str, str]) -> None:
+    def _add(self, episodes: Episodes | GroupEpisodes, facts: Mapping[str, str]) -> None:
         assert self._writer is not None
         policy = self._writer.add_policy(facts, episodes.policy)
         for episode in episodes.complete():

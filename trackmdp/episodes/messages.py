@@ -3,29 +3,31 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from trackmdp.episodes.episode import Episode
+from trackmdp.episodes.episode import Episode, Recording
 from trackmdp.episodes.grids import read_grids
 from trackmdp.episodes.schema import LoggedRun, tick_of, time_of
 from trackmdp.errors import UserError
 
+Messages: TypeAlias = Mapping[str, list[bytes]]
+"""Topic -> the messages of an episode, in the order of its steps."""
+
 _WORDS = ("false", "true")
 
 
-def row_of(episode: Episode, t_max: int, first_tick: int) -> dict[str, Any]:
-    """The `/episode` message."""
-    of_mode = {} if episode.mode is None else {"start_mode": episode.start_mode}
-    return of_mode | {
+def row_of(episode: Recording, start: Any, t_max: int, first_tick: int) -> dict[str, Any]:
+    """The `/episode` message; `start` is a cell, or one for each of several targets."""
+    return {
         "episode": episode.number,
         # Seeds have 63 bits and times in ns 60: as JSON numbers, a viewer in JavaScript would round them, which it
         # does beyond 2^53.
         "seed": str(episode.seed),
         "policy": episode.policy,
-        "start": episode.start,
+        "start": start,
         "length": len(episode),
         "return": float(episode.returns[-1]),
         "detections": int(episode.located.sum()),
@@ -73,37 +75,57 @@ def step_messages(episode: Episode, run: LoggedRun) -> Iterator[bytes]:
         ).encode()
 
 
-def decode(row: dict[str, Any], steps: list[bytes], grids: list[bytes], run: LoggedRun) -> Episode:
-    """The episode that these messages of the log `run` were made from.
+def decode(row: dict[str, Any], messages: Messages, run: LoggedRun) -> Episode:
+    """The episode of one target that these messages of the log `run` were made from.
 
     Raises:
         UserError, ValueError, KeyError, TypeError: they do not fit together.
     """
-    number, count = row["episode"], row["length"]
-    said = [json.loads(step) for step in steps]
-    # Lengths first: a row may claim any length.
-    steps_of = ((each["episode"], each["t"]) for each in said)
-    if not len(said) == len(grids) == count or any(
-        each != (number, t) for t, each in enumerate(steps_of)
-    ):
-        raise UserError(f"episode={number}: its steps do not fit together")
-    belief, probability = read_grids(grids, run.size)
-    target = np.array([each["target"] for each in said], dtype=np.int64)
-    action = np.zeros((count, run.sensors), dtype=bool)
-    for t, each in enumerate(said):
-        action[t, each["active"]] = True
+    said = steps_said(row, messages, ("/grid",))
+    belief, probability = read_grids(messages["/grid"], run.size)
     return Episode(
-        number=number,
-        seed=int(row["seed"]),
-        **{name: row[name] for name in ("policy", "start", "terminated", "truncated")},
-        misses=np.array([each["n"] for each in said], dtype=np.int64),
-        action=action,
+        **common(row, said, run),
+        start=row["start"],
         belief=belief,
         probability=probability,
-        target=np.where(target < 0, run.cells, target),
-        located=np.array([each["obs"] >= 0 for each in said]),
-        reward=np.array([each["reward"] for each in said], dtype=np.float32),
-        first_tick=tick_of(int(row["start_time"])),
         mode=np.array([each["mode"] for each in said], dtype=np.int64) if run.modes else None,
         start_mode=row["start_mode"] if run.modes else 0,
     )
+
+
+def steps_said(
+    row: dict[str, Any], messages: Messages, layers: Iterable[str]
+) -> list[dict[str, Any]]:
+    """The contents of the `/step` messages of an episode.
+
+    Raises:
+        UserError: they, or the messages of `layers`, are not as many as its row says.
+    """
+    number, count = row["episode"], row["length"]
+    said = [json.loads(step) for step in messages["/step"]]
+    # Lengths first: a row may claim any length.
+    steps_of = ((each["episode"], each["t"]) for each in said)
+    if any(len(messages.get(topic, ())) != count for topic in ("/step", *layers)) or any(
+        each != (number, t) for t, each in enumerate(steps_of)
+    ):
+        raise UserError(f"episode={number}: its steps do not fit together")
+    return said
+
+
+def common(row: dict[str, Any], said: list[dict[str, Any]], run: LoggedRun) -> dict[str, Any]:
+    """What an episode of one target and one of several are both made of."""
+    target = np.array([each["target"] for each in said], dtype=np.int64)
+    action = np.zeros((len(said), run.sensors), dtype=bool)
+    for t, each in enumerate(said):
+        action[t, each["active"]] = True
+    return {
+        "number": row["episode"],
+        "seed": int(row["seed"]),
+        **{name: row[name] for name in ("policy", "terminated", "truncated")},
+        "misses": np.array([each["n"] for each in said], dtype=np.int64),
+        "action": action,
+        "target": np.where(target < 0, run.cells, target),
+        "located": np.array([each["obs"] for each in said]) >= 0,
+        "reward": np.array([each["reward"] for each in said], dtype=np.float32),
+        "first_tick": tick_of(int(row["start_time"])),
+    }

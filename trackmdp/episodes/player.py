@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import select
 import sys
@@ -12,88 +11,73 @@ import tty
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from trackmdp.episodes.episode import Episode
-from trackmdp.world.model import Task, World
-from trackmdp.world.render import FOUND, MISSED, ON, PICTURE_LEGEND, around, symbols
+from trackmdp.episodes.episode import Recording
+from trackmdp.episodes.sentences import sentence
+from trackmdp.world.model import Task
+from trackmdp.world.render import (
+    FOUND,
+    FOUND_OF_SEVERAL,
+    LEGEND_OF_SEVERAL,
+    MISSED,
+    ON,
+    PICTURE_LEGEND,
+    around,
+    symbols,
+)
 
 WIDE, STEP = 37, 9
 """Rows and columns of a grid that are drawn at most, which 80 characters hold, and how far the part drawn moves at
 once: it stays where it is while the target does not leave 9 x 9 cells."""
 _SHADES = " ·░▒▓"
-_ARROWS = "→↗↑↖←↙↓↘"
-_STILL = 0.05
-"""Mean cells a step below which a mode has no direction."""
-LEGEND = f"{FOUND} target, located   {MISSED} target, missed   {ON} sensor on   ·░▒▓ where it was expected"
 
 
-def outcome(episode: Episode, t: int, task: Task) -> str:
-    """The outcome of step `t`: exited, forced, detected or missed."""
-    if episode.target[t] == task.num_cells:
-        return "exited"
-    if episode.misses[t] > task.t_max:
-        return "forced"
-    return "detected" if episode.located[t] else "missed"
-
-
-def where(cell: int, columns: int) -> str:
-    """A cell in words, counted from 1."""
-    return f"row {cell // columns + 1}, column {cell % columns + 1}"
-
-
-def mode_words(world: World, mode: int) -> str:
-    """A mode in words: its number, as in the log, and how it moves on average."""
-    down, across = world.drift[mode]
-    speed = math.hypot(down, across)
-    # Up is to smaller rows; eighths of a turn from the right, turning left.
-    eighth = round(math.atan2(-down, across) / (math.pi / 4)) % 8
-    return f"mode {mode}" + (
-        f" {_ARROWS[eighth]} {speed:.1f} cells a step" if speed > _STILL else ""
+def frame_legend(episode: Recording) -> str:
+    """What the symbols of a frame mean."""
+    found, missed = (
+        FOUND_OF_SEVERAL
+        if episode.target.ndim > 1
+        else (f"{FOUND} target, located", f"{MISSED} target, missed")
     )
+    return f"{found}   {missed}   {ON} sensor on   ·░▒▓ where it was expected"
 
 
-def sentence(episode: Episode, t: int, task: Task) -> str:
-    """A step in one line; with the target's mode, where `task` is a world of targets that have one."""
-    state = outcome(episode, t, task)
-    place = where(int(episode.target[t]), task.columns)
-    words = {
-        "exited": "the target has left the grid",
-        "forced": f"safe action forced, target located in {place}",
-    }
-    found = words.get(state, f"target {state} in {place}")
-    if isinstance(task, World) and episode.mode is not None and episode.mode[t] >= 0:
-        found += f" in {mode_words(task, int(episode.mode[t]))}"
-    on = "" if state == "forced" else f"{episode.action[t].sum()} sensors on, "
-    reward = f"reward {episode.reward[t]:.2f}, total {episode.returns[t]:.2f}"
-    return (
-        f"step {t + 1} of {len(episode)}: {found}; {on}{episode.misses[t]} misses before; {reward}"
-    )
-
-
-def frame(episode: Episode, t: int, task: Task) -> str:
-    """The grid at a step, of a large one the part around the target: it, over the sensors on, over the belief."""
-    belief = np.zeros(task.num_cells) if episode.belief is None else episode.belief[t]
+def frame(episode: Recording, t: int, task: Task) -> str:
+    """The grid at a step, of a large one the part around the targets: they, over the sensors on, over the belief."""
     # digitize gives 0 below 1e-6, 1 below .05, ... 4 from .5 on: an index into the shades.
-    levels = np.digitize(belief, [1e-6, 0.05, 0.2, 0.5])
-    on = task.covered(episode.action[t]) & (outcome(episode, t, task) != "forced")
-    shades, found = np.array(list(_SHADES))[levels], bool(episode.located[t])
-    marks = symbols(task.size, int(episode.target[t]), on, found=found, empty=shades)
-    # Drawn around the target, or around its last cell before it left.
-    seen = [cell for cell in episode.target[max(t - 1, 0) : t + 1] if cell < task.num_cells]
-    at = seen[-1] if seen else episode.start
-    # Row 100 lies in the part of rows 99 to 107, with the middle 103.
-    middle = (place // STEP * STEP + STEP // 2 for place in divmod(int(at), task.columns))
+    levels = np.digitize(episode.expected(t, task.num_cells), [1e-6, 0.05, 0.2, 0.5])
+    on = task.covered(episode.action[t]) & ~episode.forced(task.t_max)[t]
+    shades = np.array(list(_SHADES))[levels]
+    marks = symbols(task.size, episode.target[t], on, found=episode.located[t], empty=shades)
+    # Drawn around the targets, or around where they were before the last one left.
+    middle = (place // STEP * STEP + STEP // 2 for place in _middle(episode, [t, t - 1], task))
     parts = _parts(middle, task, WIDE)
     rows = [" ".join(row) for row in marks[np.ix_(*parts)]]
     edge = "─" * (2 * len(parts[1]) + 1)
     return "\n".join(
         [f"┌{edge}┐", *(f"│ {row} │" for row in rows), f"└{edge}┘", *_cut(task, parts)]
     )
+
+
+def _middle(episode: Recording, steps: Iterable[int], task: Task) -> tuple[int, int]:
+    """Row and column amid the targets at the first of `steps` at which one is in the grid, or of their start."""
+    cells = (np.atleast_1d(episode.target[t] if t >= 0 else episode.start) for t in steps)
+    inside = (each[each < task.num_cells] for each in cells)
+    return _amid(next((each for each in inside if len(each)), np.atleast_1d(episode.start)), task)
+
+
+def _amid(cells: npt.NDArray[np.integer[Any]], task: Task) -> tuple[int, int]:
+    """Row and column in the middle of some cells."""
+    way = np.array(np.divmod(cells, task.columns))
+    row, column = ((way.min(1) + way.max(1)) // 2).tolist()
+    return row, column
 
 
 def _parts(middle: Iterable[int], task: Task, wide: int) -> tuple[range, range]:
@@ -162,12 +146,12 @@ class Playing:
         self.paused = self.t == self.steps - 1
 
 
-def play(console: Console, episode: Episode, task: Task, speed: float) -> None:
+def play(console: Console, episode: Recording, task: Task, speed: float) -> None:
     """Show an episode until it is quit, or all its steps as text where there is no terminal to play at."""
     if not (console.is_terminal and sys.stdin.isatty()):
         for t in range(len(episode)):
             console.print(f"{sentence(episode, t, task)}\n{frame(episode, t, task)}", markup=False)
-        console.print(LEGEND, markup=False)
+        console.print(frame_legend(episode), markup=False)
         return
     state = Playing(len(episode), speed)
     with _keys() as descriptor, Live(console=console, auto_refresh=False, screen=True) as live:
@@ -182,10 +166,10 @@ def play(console: Console, episode: Episode, task: Task, speed: float) -> None:
             due = time.monotonic() + 1 / state.speed if not key or key == " " else due
 
 
-def _screen(episode: Episode, state: Playing, task: Task) -> str:
+def _screen(episode: Recording, state: Playing, task: Task) -> str:
     moves = "paused" if state.paused else f"{state.speed:g} steps/s"
     text = sentence(episode, state.t, task)
-    return f"{text}\n\n{frame(episode, state.t, task)}\n\n{LEGEND}\n{moves}   {KEYS}"
+    return f"{text}\n\n{frame(episode, state.t, task)}\n\n{frame_legend(episode)}\n{moves}   {KEYS}"
 
 
 @contextmanager
@@ -211,26 +195,28 @@ PICTURE_WIDE = 21
 """Rows and columns of a grid that are drawn at most in each frame of a picture."""
 
 
-def draw_picture(episodes: Sequence[Episode], task: Task, *, steps: int = 6) -> str:
+def draw_picture(episodes: Sequence[Recording], task: Task, *, steps: int = 6) -> str:
     """The first `steps` steps of an episode, side by side, under the legend.
 
-    Of a grid larger than `PICTURE_WIDE` only the part around the target.
+    Of a grid larger than `PICTURE_WIDE` only the part around the targets.
 
     Args:
         episodes: drawn is the first of them with so many steps in the grid, or the longest.
         task: where they took place.
-        steps: frames drawn at most; fewer if the target exits before.
+        steps: frames drawn at most; fewer if all targets exit before.
     """
     # Longer than `steps`: the picture is then full, and does not end with the exit.
     episode = next((each for each in episodes if len(each) > steps), None) or max(episodes, key=len)
-    cells = [cell for cell in episode.target[:steps].tolist() if cell < task.num_cells]
-    way = np.array([divmod(cell, task.columns) for cell in cells or [episode.start]])
-    parts = _parts((int(each) for each in (way.min(0) + way.max(0)) // 2), task, PICTURE_WIDE)
-    columns = []
-    for t, cell in enumerate(cells):
-        on = task.covered(episode.action[t]) | (episode.misses[t] > task.t_max)
-        marks = symbols(task.size, cell, on, found=bool(on[cell]))[np.ix_(*parts)]
+    target = episode.target[:steps].reshape(min(steps, len(episode)), -1)
+    inside = target < task.num_cells
+    cells = target[inside] if inside.any() else np.atleast_1d(episode.start)
+    parts = _parts(_amid(cells, task), task, PICTURE_WIDE)
+    columns, forced = [], episode.forced(task.t_max)
+    for t in np.flatnonzero(inside.any(axis=1)).tolist():
+        on = task.covered(episode.action[t]) | forced[t]
+        marks = symbols(task.size, target[t], on, found=episode.located[t])[np.ix_(*parts)]
         column = [f"step {t + 1}", *map(" ".join, marks)]
         columns.append([row.ljust(max(map(len, column))) for row in column])
     lines = ["   ".join(row).rstrip() for row in zip(*columns, strict=True)]
-    return "\n".join([*lines, "", *_cut(task, parts), PICTURE_LEGEND, ""])
+    key = PICTURE_LEGEND if target.shape[1] == 1 else LEGEND_OF_SEVERAL
+    return "\n".join([*lines, "", *_cut(task, parts), key, ""])

@@ -15,14 +15,16 @@ from tensordict import TensorDict
 
 from trackmdp.episodes import schema
 from trackmdp.episodes.container import Container, Damaged, Said, reading
-from trackmdp.episodes.episode import Episode, first_difference
-from trackmdp.episodes.messages import decode
+from trackmdp.episodes.episode import Recording, first_difference
 from trackmdp.episodes.schema import LoggedRun, versions_apart
 from trackmdp.episodes.simulate import resimulate
+from trackmdp.episodes.written import form_of
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import unpacked_policy
+from trackmdp.solvers.merging import Rule, make_rule
 from trackmdp.untrusted import load_npz
+from trackmdp.world.group import Group
 from trackmdp.world.problem_file import PROBLEM, problem_in
 from trackmdp.world.tracks import Problem
 
@@ -43,7 +45,7 @@ class EpisodeReader:
     def __init__(self, file: Path | str) -> None:
         self.file = Path(file)
         self._container = Container(self.file)
-        self._built: Problem | None = None
+        self._built: Problem | Group | None = None
         # Short episodes share a chunk: read one after another, the chunk is unpacked once.
         self._held: tuple[int, list[Said]] = (-1, [])
         # A constructor that raises leaves nobody to close the file.
@@ -58,6 +60,7 @@ class EpisodeReader:
         except Damaged as error:
             raise UserError(f"file={self.file}: not a log of trackmdp ({error})") from error
         self.run = LoggedRun.of(self.file, said)
+        self._form = form_of(self.run)
         self.end = self._metadata(schema.END)
         count = int(self.end["policies"])
         # One by one: a count that is too large ends at the first name that is missing.
@@ -84,9 +87,9 @@ class EpisodeReader:
 
     def __getitem__(self, number: int) -> TensorDict:
         """Episode `number` as a TensorDict `[T]`, keys as in `TrackEnv`."""
-        return self.read(number).to_tensordict(self.world())
+        return self.read(number).to_tensordict(self.world().task)
 
-    def episodes(self) -> Iterator[Episode]:
+    def episodes(self) -> Iterator[Any]:
         """All episodes, one after another, with belief and policy."""
         return (self.read(number) for number in self._rows)
 
@@ -101,14 +104,14 @@ class EpisodeReader:
             raise UserError(f"episode={number}: {self.file} holds {len(self)} episodes ({ends})")
         return self._rows[number]
 
-    def read(self, number: int) -> Episode:
-        """Episode `number`."""
+    def read(self, number: int) -> Any:
+        """Episode `number`, an `Episode`, or a `GroupEpisode` of several targets."""
         row = self.row(number)
         mine: dict[str, list[bytes]] = {"/step": [], "/grid": []}
         with reading(self.file):
             for topic, data in self._between(int(row["start_time"]), int(row["end_time"])):
                 mine.setdefault(topic, []).append(data)
-            return decode(row, mine["/step"], mine["/grid"], self.run)
+            return self._form.decode(row, mine)
 
     def _between(self, begin: int, end: int) -> Iterator[tuple[str, bytes]]:
         """The messages from one log time to another; the chunk read last is kept, for the episode after."""
@@ -127,41 +130,57 @@ class EpisodeReader:
                 raise Damaged(f"the digest of attachment {name}")
         return content
 
-    def policy_table(self, number: int) -> bytes | None:
-        """The file of policy `number`; None if it has no table."""
-        sha256 = self.policies[number]["table.sha256"]
-        return self.attachment(schema.policy_file(number), sha256) if sha256 else None
+    def policy_tables(self, number: int) -> list[bytes]:
+        """The files of policy `number`, one for each motion; empty if it has no table."""
+        digests = self.policies[number]
+        kinds = range(max(self.run.kinds, default=0) + 1)
+        found = {
+            kind: digests[schema.table_digest(kind)]
+            for kind in kinds
+            if digests[schema.table_digest(0)]
+        }
+        return [
+            self.attachment(schema.policy_file(number, kind), each) for kind, each in found.items()
+        ]
 
-    def policy(self, number: int) -> Policy:
+    def policy(self, number: int) -> Policy | Rule:
         """Policy `number`, as it acted.
 
         Raises:
             UserError: it has no table.
         """
-        facts, task = self.policies[number], self.world().remembering()
+        facts, problem = self.policies[number], self.world()
+        tables = self.policy_tables(number)
+        if not tables:
+            raise UserError(f"file={self.file}: policy {number} has no table, and cannot act again")
+        task = problem.task.remembering()
         if "memory" in facts:
             clip, revealed = int(facts["clip"]), int(facts["revealed"])
             task = task.remembering(facts["memory"], clip=clip, revealed=revealed)
-        table = self.policy_table(number)
-        if table is None:
-            raise UserError(f"file={self.file}: policy {number} has no table, and cannot act again")
         with reading(self.file):
-            return Policy.from_table(unpacked_policy(task, load_npz(io.BytesIO(table))))
+            found = [unpacked_policy(task, load_npz(io.BytesIO(table))) for table in tables]
+            if isinstance(problem, Group):
+                return make_rule(problem, found, facts["merge"])
+            return Policy.from_table(found[0])
 
-    def world(self) -> Problem:
-        """The world in which the episodes were recorded, or the tracks along which they were."""
+    def world(self) -> Any:
+        """The world in which the episodes were recorded, the tracks along which they were, or a `Group` of targets."""
         # Kept, since every episode that becomes a TensorDict needs it.
         if self._built is None:
             with reading(self.file):
                 self._built = self._world()
         return self._built
 
-    def _world(self) -> Problem:
-        problem, run = problem_in(io.BytesIO(self.attachment(PROBLEM))), self.run
-        found = problem.size, problem.total_sensors, problem.t_max
-        if found != (run.size, run.sensors, run.t_max):
-            raise Damaged(PROBLEM)
-        return problem
+    def _world(self) -> Problem | Group:
+        run = self.run
+        kinds: list[Any] = [
+            problem_in(io.BytesIO(self.attachment(name))) for name in run.tables[1:]
+        ]
+        for problem in kinds:
+            found = problem.size, problem.total_sensors, problem.t_max
+            if found != (run.size, run.sensors, run.t_max):
+                raise Damaged(PROBLEM)
+        return Group([kinds[kind] for kind in run.kinds]) if run.kinds else kinds[0]
 
     def check_all(self) -> None:
         """Check every byte of the file, those without meaning to this reader included."""
@@ -211,10 +230,10 @@ def verify(reader: EpisodeReader, *, numbers: list[int] | None = None) -> Verifi
 
 
 def _again(
-    reader: EpisodeReader, world: Problem, policy: Policy, numbers: list[int]
-) -> Iterator[tuple[int, Episode]]:
+    reader: EpisodeReader, world: Problem | Group, policy: Policy | Rule, numbers: list[int]
+) -> Iterator[tuple[int, Recording]]:
     rows = [reader.row(number) for number in numbers]
-    again = resimulate(world, policy, [int(row["seed"]) for row in rows]).complete()
+    again: Any = resimulate(world, policy, [int(row["seed"]) for row in rows]).complete()
     # Simulated episodes do not know under which number and policy they were logged.
     return (
         (row["episode"], replace(one, policy=row["policy"]))

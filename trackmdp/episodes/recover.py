@@ -14,10 +14,10 @@ from mcap.records import Attachment, Chunk, DataEnd, Metadata
 
 from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged, Said
-from trackmdp.episodes.episode import Episode
-from trackmdp.episodes.messages import decode
+from trackmdp.episodes.episode import Recording
 from trackmdp.episodes.schema import LoggedRun
 from trackmdp.episodes.writer import EpisodeWriter
+from trackmdp.episodes.written import form_of
 from trackmdp.errors import UserError
 from trackmdp.untrusted import reason
 
@@ -152,7 +152,7 @@ def _begin(file: Path, target: Path, parts: _Parts, damaged: list[str]) -> Episo
         run = LoggedRun.of(file, parts.metadata[schema.RUN])
         with _noting(damaged):
             # Without the problem, the log could not be simulated again.
-            tables = {n: parts.attached(n, run.said.get(f"{n}.sha256")) for n in schema.TABLES}
+            tables = {n: parts.attached(n, run.said.get(f"{n}.sha256")) for n in run.tables}
             return EpisodeWriter(target, run, tables)
     return None
 
@@ -162,15 +162,23 @@ def _add_policies(writer: EpisodeWriter, parts: _Parts, count: int) -> None:
     # One after another: the number of a policy is its place.
     for each in range(writer.policies, count):
         facts = dict(parts.metadata[f"{schema.POLICY}.{each}"])
-        sha256 = facts.pop("table.sha256")
-        table = parts.attached(schema.policy_file(each), sha256) if sha256 else None
+        named = (schema.table_digest(kind) for kind in range(max(writer.run.kinds, default=0) + 1))
+        digests = [facts.pop(name) for name in named if name in facts]
+        tables = [
+            parts.attached(schema.policy_file(each, kind), sha256)
+            for kind, sha256 in enumerate(digests)
+            if sha256
+        ]
         writer.flush()  # as when it was recorded, so that a copy has the same bytes
-        writer.copy_policy(facts, table)
+        writer.copy_policy(facts, tables)
 
 
-def _episode(row: dict[str, Any], held: list[Said], run: LoggedRun) -> Episode:
+def _episode(row: dict[str, Any], held: list[Said], run: LoggedRun) -> Recording:
     """The episode of a row; before its messages those of another may be held, with an end that was lost."""
     begin, end = int(row["start_time"]), int(row["end_time"])
-    mine = [(topic, data) for topic, time, data in held if begin <= time <= end]
-    steps, grids = ([data for topic, data in mine if topic == name] for name in ("/step", "/grid"))
-    return decode(row, steps, grids, run)
+    mine: dict[str, list[bytes]] = {"/step": [], "/grid": []}
+    for topic, time, data in held:
+        if begin <= time <= end:
+            mine.setdefault(topic, []).append(data)
+    found: Recording = form_of(run).decode(row, mine)
+    return found

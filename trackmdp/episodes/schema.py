@@ -64,14 +64,45 @@ _TOPICS = {
     "/episode": ("trackmdp.Episode", "One episode, at the time of its last step"),
 }
 
+
+def _schema(name: str, title: str) -> dict[str, Any]:
+    return {"title": title, "type": "object", "properties": _FIELDS[name]}
+
+
 SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
-    topic: (name, {"title": title, "type": "object", "properties": _FIELDS[name]})
-    for topic, (name, title) in _TOPICS.items()
+    topic: (name, _schema(name, title)) for topic, (name, title) in _TOPICS.items()
 }
 """Topic -> (name of its schema, JSON schema), within the subset that viewers read: no null, no array of arrays.
 
 Cells are numbered row by row from the top left; -1 stands for no cell: a target that exited, nothing observed.
 """
+
+_PER_TARGET = ("n", "last_cell", "target", "target_x", "target_y", "obs")
+
+
+def _of_several(topic: str) -> tuple[str, dict[str, Any]]:
+    """The schema of a topic where an entry of each target takes the place of one."""
+    name, said = SCHEMAS[topic]
+    numbers = {"type": "array", "items": {"type": "integer"}}
+    of_each = dict.fromkeys(_PER_TARGET if topic == "/step" else ("start",), numbers)
+    inside = {"n_present": {"type": "integer"}} if topic == "/step" else {}
+    fields = said["properties"] | of_each | inside
+    return name.replace(".", ".Group"), said | {"properties": fields}
+
+
+def belief_topic(target: int) -> str:
+    """The topic of where one of several targets is expected."""
+    return f"/belief/{target}"
+
+
+def schemas_of_several(targets: int) -> dict[str, tuple[str, dict[str, Any]]]:
+    """`SCHEMAS` of a log of K targets."""
+    scene = ("foxglove.SceneUpdate", _schema("foxglove.SceneUpdate", "the targets, by number"))
+    single = {topic: SCHEMAS[topic] for topic in ("/grid", "/active", "/part")}
+    of_each = {belief_topic(each): SCHEMAS["/grid"] for each in range(targets)}
+    steps = {topic: _of_several(topic) for topic in ("/step", "/episode")}
+    return steps | single | of_each | {"/targets": scene}
+
 
 MODE = {"/step": {"mode": {"type": "integer"}}, "/episode": {"start_mode": {"type": "integer"}}}
 """Topic -> further properties of its messages, in logs of targets with a mode."""
@@ -124,9 +155,19 @@ TABLES = ("config.yaml", PROBLEM)
 """Attachments that every log begins with: the run's config, and the world or the held-out tracks."""
 
 
-def policy_file(number: int) -> str:
+def numbered(name: str, kind: int) -> str:
+    """The attachment `name` of one of the motions of several targets."""
+    return name if kind == 0 else f"{Path(name).stem}-{kind}.npz"
+
+
+def policy_file(number: int, kind: int = 0) -> str:
     """The attachment with the table of a policy."""
-    return f"policy-{number}.npz"
+    return numbered(f"policy-{number}.npz", kind)
+
+
+def table_digest(kind: int) -> str:
+    """The entry of a policy's metadata with the digest of its table."""
+    return "table.sha256" if kind == 0 else f"table-{kind}.sha256"
 
 
 class LoggedRun:
@@ -139,6 +180,7 @@ class LoggedRun:
         sensors: S.
         modes: of the targets; 0 where they have none.
         t_max: T_max.
+        kinds: of several targets, for each the number of its motion; empty in a log of one target.
 
     Raises:
         ValueError, KeyError: one is missing, or is no number.
@@ -150,6 +192,31 @@ class LoggedRun:
         self.cells = math.prod(self.size)
         self.sensors = int(said.get("sensors", self.cells))
         self.modes, self.t_max = int(said.get("modes", 0)), int(said["t_max"])
+        self.kinds = tuple(map(int, said.get("targets", "").split()))
+        if any(
+            kind not in {0, *(each + 1 for each in self.kinds[:k])}
+            for k, kind in enumerate(self.kinds)
+        ):
+            raise ValueError("targets of other motions than those in the file")
+
+    @property
+    def tables(self) -> list[str]:
+        """The attachments that the log begins with."""
+        return [
+            *TABLES,
+            *(numbered(PROBLEM, kind) for kind in range(1, max(self.kinds, default=0) + 1)),
+        ]
+
+    @property
+    def schemas(self) -> dict[str, tuple[str, dict[str, Any]]]:
+        """Topic -> (name of its schema, JSON schema)."""
+        if self.kinds:
+            return schemas_of_several(len(self.kinds))
+        more = MODE if self.modes else {}
+        return {
+            topic: (name, said | {"properties": said["properties"] | more.get(topic, {})})
+            for topic, (name, said) in SCHEMAS.items()
+        }
 
     @classmethod
     def of(cls, file: Path, said: Mapping[str, str]) -> LoggedRun:

@@ -5,8 +5,8 @@ The log, the web page, the picture and the simulated figures of an evaluation ar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -15,45 +15,77 @@ from torch import Tensor
 
 from trackmdp.episodes.actors import Actor, States, actor_of
 from trackmdp.episodes.batch import Episodes
+from trackmdp.episodes.episode_draws import Draws
+from trackmdp.episodes.group_episodes import GroupEpisodes
 from trackmdp.errors import UserError
 from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import PolicyLike
 from trackmdp.seeding import derive, preserved_global_rng
+from trackmdp.solvers.merging import Rule
 from trackmdp.solvers.solve import named_policy
-from trackmdp.solvers.value import check_revealed
+from trackmdp.solvers.value import check_revealed, group_rule
+from trackmdp.world.group import Group
 from trackmdp.world.outcomes import Costs, Outcomes
 from trackmdp.world.paths import PathSampler, path_sampler
 from trackmdp.world.tracks import Problem, check_problem
 
-_BLOCK = 256  # draws taken from an episode's generator at a time; part of the meaning of a seed, so never to be changed
 
-
+@overload
 def simulate(
     problem: Problem,
     policy: PolicyLike | Playback,
     episodes: int,
     *,
+    seed: int = ...,
+    names: Sequence[str | int] = ...,
+) -> Episodes: ...
+@overload
+def simulate(
+    problem: Group,
+    policy: PolicyLike | Rule,
+    episodes: int,
+    *,
+    seed: int = ...,
+    names: Sequence[str | int] = ...,
+    merge: str = ...,
+) -> GroupEpisodes: ...
+
+
+def simulate(
+    problem: Problem | Group,
+    policy: PolicyLike | Playback | Rule,
+    episodes: int,
+    *,
     seed: int = 0,
     names: Sequence[str | int] = (),
-) -> Episodes:
+    **of_group: str,
+) -> Episodes | GroupEpisodes:
     """Independent episodes of a policy, each followed to its own end.
 
     Keeping the first ones to finish would favour short episodes; here every episode that is begun is kept.
 
     Args:
-        problem: a world, in which targets start uniformly; or recorded tracks, of which held-out ones are drawn.
+        problem: a world, in which targets start uniformly; recorded tracks, of which held-out ones are drawn; or a
+            `Group` of targets.
         policy: as for `evaluate`; a function or module is asked at every step if it draws, and is then the only
             thing not reproduced by an episode's seed alone.
         episodes: how many.
         seed: seed of the run; episode i has the seed called ("episode", *names, i) of it.
         names: further names of the seeds, different for each simulation of a run.
+        **of_group: of a `Group` alone: `merge`, "gains" or "union", as of `evaluate`.
 
     Raises:
         UserError: the policy is made for another grid, or is none; `episodes` or `seed` is no such number.
     """
-    check_problem(problem, "simulate")
+    if not isinstance(problem, Group):
+        check_problem(problem, "simulate")
     if not isinstance(episodes, (int, np.integer)) or episodes < 0:
         raise UserError(f"simulate: episodes={episodes}, expected an integer >= 0")
+    if isinstance(problem, Group):
+        rule = group_rule(problem, policy, **of_group)
+        return GroupEpisodes(rule, episode_seeds(seed, episodes, *names))
+    if of_group:
+        raise UserError(f"{min(of_group)}: an option of several targets, expected none with one")
     if isinstance(policy, str):
         policy = named_policy(problem, policy)
     return resimulate(problem, policy, episode_seeds(seed, episodes, *names))
@@ -64,9 +96,22 @@ def episode_seeds(seed: int, episodes: int, *names: str | int) -> list[int]:
     return [derive(seed, "episode", *names, number) for number in range(episodes)]
 
 
+@overload
+def resimulate(
+    problem: Problem, policy: PolicyLike | Playback, seeds: Sequence[int]
+) -> Episodes: ...
+@overload
+def resimulate(problem: Group, policy: Rule, seeds: Sequence[int]) -> GroupEpisodes: ...
+
+
 @torch.no_grad()
-def resimulate(problem: Problem, policy: PolicyLike | Playback, seeds: Sequence[int]) -> Episodes:
+def resimulate(
+    problem: Problem | Group, policy: PolicyLike | Playback | Rule, seeds: Sequence[int]
+) -> Episodes | GroupEpisodes:
     """One episode for each of `seeds`, in their order; each independent of the others. See `simulate`."""
+    if isinstance(policy, Rule):
+        return GroupEpisodes(policy, seeds)
+    assert not isinstance(problem, Group)
     outcomes, sampler = Outcomes(problem), path_sampler(problem, held_out=True)
     actor = actor_of(problem.task, policy, Costs(problem))
     if actor.policy is not None:
@@ -79,35 +124,6 @@ def resimulate(problem: Problem, policy: PolicyLike | Playback, seeds: Sequence[
         torch.manual_seed(derive(seeds[0] if seeds else 0, "policy"))
         parts = [_Batch(problem, sampler, actor, outcomes, some).run() for some in at_once]
     return Episodes.of(problem, actor.policy, seeds, parts)
-
-
-class _Draws:
-    """Draws of many episodes, each from a generator of its own, `_BLOCK` steps at a time."""
-
-    _block: Tensor
-
-    def __init__(
-        self, seeds: Sequence[int], draw: Callable[[int, torch.Generator], Tensor], *names: str
-    ) -> None:
-        # A generator for each episode, not one for the batch: its draws must not depend on how many others
-        # run beside it, nor on when they end.
-        seeds = [derive(seed, *names) for seed in seeds] if names else seeds
-        self.generators, self._draw = [torch.Generator().manual_seed(seed) for seed in seeds], draw
-
-    def at(self, states: States) -> Tensor:
-        """`[R, ...]`, those of the running episodes at their step."""
-        place = states.step % _BLOCK
-        # At steps 0, 256, 512, ...: all running episodes are at the same step, and refill together; ended ones draw no
-        # more.
-        if place == 0:
-            drawn = torch.stack(
-                [self._draw(_BLOCK, self.generators[row]) for row in states.row.tolist()]
-            )
-            if states.step:
-                self._block[states.row] = drawn
-            else:
-                self._block = drawn
-        return self._block[states.row, place]
 
 
 class _Batch:
@@ -126,14 +142,14 @@ class _Batch:
         # A policy has keys of its own; all other actors know the cell.
         self._keys = (actor.policy.task if actor.policy else problem.remembering()).keys
         # Moves, choices and reports apart, so that two policies with one seed meet the same target.
-        self._moves, self._choices, self._seen = _Draws(seeds, sampler.draw), None, None
+        self._moves, self._choices, self._seen = Draws(seeds, sampler.draw), None, None
         if size := actor.num_draws:
-            self._choices = _Draws(
+            self._choices = Draws(
                 seeds, lambda count, rng: torch.rand(count, size, generator=rng), "policy"
             )
         if not outcomes.certain:
             double = torch.float64
-            self._seen = _Draws(
+            self._seen = Draws(
                 seeds, lambda count, rng: torch.rand(count, dtype=double, generator=rng), "report"
             )
         self._taken: list[dict[str, npt.NDArray[Any]]] = []
@@ -171,12 +187,14 @@ class _Batch:
 
     def _step(self, at: States) -> States:
         """One step of `TrackEnv`, of the episodes still running; the same order of events, the same arithmetic."""
-        choice = self._actor.decide(at, None if self._choices is None else self._choices.at(at))
-        place = self._sampler.move(at.place, self._moves.at(at))
+        choice = self._actor.decide(
+            at, None if self._choices is None else self._choices.at(at.row, at.step)
+        )
+        place = self._sampler.move(at.place, self._moves.at(at.row, at.step))
         target = self._sampler.cell(place)
         # A target that exited is at M, which is no column: it looks up the last cell, and the answer is not used.
         report = choice.report(target.clamp_max(self._task.num_cells - 1))
-        seen = None if self._seen is None else self._seen.at(at)
+        seen = None if self._seen is None else self._seen.at(at.row, at.step)
         outcome = self._outcomes(report, choice.spent, at.misses, target, seen)
         in_grid, located = outcome.in_grid, outcome.located
         # An exit on the last step allowed is an exit (terminated), not a truncation.

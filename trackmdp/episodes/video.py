@@ -7,24 +7,24 @@ from typing import Any
 
 import numpy as np
 
-from trackmdp.episodes.episode import Episode
-from trackmdp.episodes.player import sentence
+from trackmdp.episodes.episode import Recording
+from trackmdp.episodes.sentences import sentence
+from trackmdp.episodes.target_colours import colour_of
 from trackmdp.errors import UserError, require
 from trackmdp.notebook.drawing import BLUE, INK, ORANGE
-from trackmdp.world.model import BoolArray
-from trackmdp.world.tracks import Problem
+from trackmdp.world.model import BoolArray, Task
 
 MOST_STEPS = 2000
 """Frames of a video; a longer episode is cut there."""
 _DPI = 110
 
 
-def write_video(file: Path, problem: Problem, episode: Episode, speed: int) -> None:
+def write_video(file: Path, task: Task, episode: Recording, speed: int) -> None:
     """Write one frame for each step: belief, cells sensed, the target and its last ten moves.
 
     Args:
         file: ends with `.gif` or `.mp4`.
-        problem: where the episode took place.
+        task: where the episode took place; a world, for the modes of its target in words.
         episode: with its belief.
         speed: steps per second.
 
@@ -34,14 +34,14 @@ def write_video(file: Path, problem: Problem, episode: Episode, speed: int) -> N
     writer = _writer(file, speed)
     from matplotlib.figure import Figure
 
-    rows, columns = problem.size
+    rows, columns = task.size
     figure = Figure(figsize=(min(6.4, 2 + 5.0 * columns / max(rows, columns)), 6.4), dpi=_DPI)
     axes = figure.subplots()
     part = file.with_name(f".{file.name}.part{file.suffix}")  # whole under its name, or not at all
     try:
         with writer.saving(figure, part, _DPI):
             for t in range(min(len(episode), MOST_STEPS)):
-                _frame(axes, problem, episode, t)
+                _frame(axes, task, episode, t)
                 writer.grab_frame()
         part.replace(file)
     finally:
@@ -65,14 +65,14 @@ def _writer(file: Path, speed: int) -> Any:
     return FFMpegWriter(speed)
 
 
-def _frame(axes: Any, problem: Problem, episode: Episode, t: int) -> None:
+def _frame(axes: Any, task: Task, episode: Recording, t: int) -> None:
     """Draw a step."""
     axes.clear()
-    rows, columns = problem.size
-    belief = np.zeros(problem.num_cells) if episode.belief is None else episode.belief[t]
-    shade = np.sqrt(belief).reshape(rows, columns)  # so that small probabilities show
+    rows, columns = task.size
+    # The root, so that small probabilities show.
+    shade = np.sqrt(np.minimum(episode.expected(t, task.num_cells), 1.0)).reshape(rows, columns)
     axes.imshow(shade, cmap="Blues", vmin=0, vmax=1.4)
-    sensed: BoolArray = problem.covered(episode.action[t]) & (episode.misses[t] <= problem.t_max)
+    sensed: BoolArray = task.covered(episode.action[t]) & ~episode.forced(task.t_max)[t]
     marks = {
         "marker": "s",
         "facecolors": "none",
@@ -81,20 +81,31 @@ def _frame(axes: Any, problem: Problem, episode: Episode, t: int) -> None:
     }
     down, across = np.divmod(np.flatnonzero(sensed), columns)
     axes.scatter(across, down, **marks)
-    path = np.array([episode.start, *episode.target[: t + 1]])[-11:]
-    path = path[path < problem.num_cells]
-    down, across = np.divmod(path, columns)
-    axes.plot(across, down, color=INK, linewidth=1, alpha=0.5)
-    if episode.target[t] < problem.num_cells:
-        face = INK if episode.located[t] else "none"
-        axes.scatter(across[-1:], down[-1:], s=60, facecolors=face, edgecolors=INK, zorder=3)
+    several = episode.target.ndim > 1
+    paths = np.concatenate([[episode.start], episode.target[: t + 1]]).reshape(t + 2, -1)[-11:].T
+    for target, path in enumerate(paths):
+        colour = colour_of(target) if several else INK
+        _target(axes, path, task, np.atleast_1d(episode.located[t])[target], colour)
+        if several and path[-1] < task.num_cells:
+            row, column = divmod(int(path[-1]), columns)
+            axes.annotate(
+                f"{target}", (column + 0.2, row - 0.2), color=colour, fontsize=8, zorder=4
+            )
     axes.set_xticks(np.arange(columns + 1) - 0.5, labels=[])
     axes.set_yticks(np.arange(rows + 1) - 0.5, labels=[])
     axes.tick_params(length=0)
     axes.grid(color="#dddddd", linewidth=0.5)
-    outcome, _, rest = sentence(episode, t, problem).partition("; ")
-    axes.set_title(f"{outcome}\n{rest}", loc="left", fontsize=8)
+    outcome, _, rest = sentence(episode, t, task).partition("; ")
+    axes.set_title(f"{outcome}\n{rest}", loc="left", fontsize=8, wrap=True)
     key = "square: sensor on   disc: target located   ring: missed"
-    axes.set_xlabel(
-        key if episode.belief is None else f"blue: belief   {key}", fontsize=8, color=BLUE
-    )
+    axes.set_xlabel(f"blue: belief   {key}" if episode.complete else key, fontsize=8, color=BLUE)
+
+
+def _target(axes: Any, path: Any, task: Task, located: bool, colour: str) -> None:
+    """Draw a target and its last moves; once it has left, only the moves."""
+    there = path[path < task.num_cells]
+    down, across = np.divmod(there, task.columns)
+    axes.plot(across, down, color=colour, linewidth=1, alpha=0.5)
+    if path[-1] < task.num_cells:
+        face = colour if located else "none"
+        axes.scatter(across[-1:], down[-1:], s=60, facecolors=face, edgecolors=colour, zorder=3)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,16 @@ import numpy as np
 from mcap.writer import Writer
 
 from trackmdp.durable import create, sync, sync_folder
-from trackmdp.episodes import messages, schema
-from trackmdp.episodes.episode import Episode
-from trackmdp.episodes.grids import grid_messages
+from trackmdp.episodes import schema
+from trackmdp.episodes.episode import Recording
 from trackmdp.episodes.schema import LoggedRun, time_of
+from trackmdp.episodes.written import form_of
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import packed
+from trackmdp.solvers.merging import Rule
 from trackmdp.untrusted import decoded
 from trackmdp.world.files import npz_bytes
+from trackmdp.world.group import Group
 from trackmdp.world.problem_file import PROBLEM, problem_bytes, problem_in
 from trackmdp.world.tracks import Problem, Recorded
 
@@ -42,23 +44,29 @@ class EpisodeWriter:
 
     @classmethod
     def of(
-        cls, file: Path, problem: Problem, *, facts: Mapping[str, str], config: str
+        cls, file: Path, problem: Problem | Group, *, facts: Mapping[str, str], config: str
     ) -> EpisodeWriter:
         """A log of `problem`, of recorded tracks those held out.
 
         Args:
             file: the log.
-            problem: where the episodes take place.
+            problem: where the episodes take place; each motion of several targets is in a file of its own.
             facts: further metadata of the run, such as `seed`.
             config: its `config.yaml`.
 
         Raises:
             UserError: the problem is too large for a log.
         """
+        tables, more = {schema.TABLES[0]: config.encode()}, {}
+        kinds: Sequence[Problem] = [problem] if not isinstance(problem, Group) else problem.kinds
+        if isinstance(problem, Group):
+            more = {"targets": " ".join(map(str, problem.kind.tolist()))}
+        problem = kinds[0]
         if isinstance(problem, Recorded):
             judged = problem.held_out
-            problem = replace(problem, tracks=judged, validation=judged, loaded={})
-        tables = dict(zip(schema.TABLES, (config.encode(), problem_bytes(problem)), strict=True))
+            kinds = [replace(problem, tracks=judged, validation=judged, loaded={})]
+        names = (schema.numbered(PROBLEM, number) for number in range(len(kinds)))
+        tables |= dict(zip(names, map(problem_bytes, kinds), strict=True))
         modes = getattr(problem, "modes", 1)
         said = {
             **schema.versions(),
@@ -68,6 +76,7 @@ class EpisodeWriter:
             **({} if problem.rows == problem.columns else {"columns": str(problem.columns)}),
             **({} if problem.coverage is None else {"sensors": str(problem.total_sensors)}),
             **({} if modes == 1 else {"modes": str(modes)}),
+            **more,
             "t_max": str(problem.t_max),
             "tick_ns": str(schema.TICK_NS),
             **{f"{name}.sha256": schema.digest(content) for name, content in tables.items()},
@@ -77,7 +86,7 @@ class EpisodeWriter:
     def __init__(self, file: Path, run: LoggedRun, tables: Mapping[str, bytes]) -> None:
         self.run = run
         with decoded(f"file={file}", "a log of trackmdp"):
-            self._coverage = problem_in(io.BytesIO(tables[PROBLEM])).coverage
+            self._form = form_of(run, problem_in(io.BytesIO(tables[PROBLEM])).coverage)
         self.file, self.part = file, file.with_name(f"{file.name}.part")
         self._rows: list[dict[str, Any]] = []
         self.policies = self._unflushed = self._tick = 0
@@ -87,9 +96,8 @@ class EpisodeWriter:
         self._writer = Writer(self._stream, enable_data_crcs=True)
         self._writer.start(library=f"trackmdp {run.said['trackmdp']}")
         # Once, and the numbers kept: registering a topic a second time would make a second channel of the same name.
-        more = schema.MODE if run.modes else {}
         self._channels = {
-            topic: self._register(topic, more.get(topic, {})) for topic in schema.SCHEMAS
+            topic: self._register(topic, *said) for topic, said in run.schemas.items()
         }
         self._tell(schema.RUN, run.said)
         for name, content in tables.items():
@@ -97,9 +105,7 @@ class EpisodeWriter:
         # In the file at once: a log that is cut off later can be recovered only with its head.
         self.flush()
 
-    def _register(self, topic: str, more: dict[str, Any]) -> int:
-        name, description = schema.SCHEMAS[topic]
-        description = description | {"properties": description["properties"] | more}
+    def _register(self, topic: str, name: str, description: dict[str, Any]) -> int:
         text = json.dumps(description, separators=(",", ":")).encode()
         number = self._writer.register_schema(name, "jsonschema", text)
         return self._writer.register_channel(topic, "json", number)
@@ -109,7 +115,7 @@ class EpisodeWriter:
         """How many episodes the log holds."""
         return len(self._rows)
 
-    def add_policy(self, facts: Mapping[str, str], policy: Policy | None) -> int:
+    def add_policy(self, facts: Mapping[str, str], policy: Policy | Rule | None) -> int:
         """Add the policy of the episodes that follow; returns its number.
 
         Args:
@@ -117,32 +123,38 @@ class EpisodeWriter:
             policy: from which `replay verify=true` simulates them again; None where there is none.
         """
         if policy is None:
-            return self.copy_policy(facts, None)
+            return self.copy_policy(facts, [])
+        if isinstance(policy, Rule):
+            tables = [npz_bytes(packed(table)) for table in policy.tables]
+            return self.copy_policy({**facts, "merge": policy.name}, tables)
         if policy.task.keyed:
             known = {
                 name: str(getattr(policy.task, name)) for name in ("memory", "clip", "revealed")
             }
             facts = {**facts, **known}
-        return self.copy_policy(facts, npz_bytes(packed(policy)))
+        return self.copy_policy(facts, [npz_bytes(packed(policy))])
 
-    def copy_policy(self, facts: Mapping[str, str], table: bytes | None) -> int:
-        """Add a policy as it was read from another log."""
-        sha256 = schema.digest(table) if table is not None else ""
-        self._tell(f"{schema.POLICY}.{self.policies}", {**facts, "table.sha256": sha256})
-        if table is not None:
-            self._attach(schema.policy_file(self.policies), table)
+    def copy_policy(self, facts: Mapping[str, str], tables: Sequence[bytes]) -> int:
+        """Add a policy as it was read from another log: of each motion its table; none where it has none."""
+        digests = {
+            schema.table_digest(kind): schema.digest(table) for kind, table in enumerate(tables)
+        }
+        sealed = {schema.table_digest(0): "", **digests}
+        self._tell(f"{schema.POLICY}.{self.policies}", {**facts, **sealed})
+        for kind, table in enumerate(tables):
+            self._attach(schema.policy_file(self.policies, kind), table)
         self.flush()
         self.policies += 1
         return self.policies - 1
 
-    def add(self, episode: Episode) -> None:
+    def add(self, episode: Recording) -> None:
         """Append an episode.
 
         Raises:
             OSError: the disk is full, or the file cannot be written for another reason.
         """
         tick = self._tick if episode.first_tick is None else episode.first_tick
-        row = messages.row_of(episode, self.run.t_max, tick)
+        row = self._form.row(episode, tick)
         self._add_messages(episode, tick, row)
         self._rows.append(row)
         self._tick = tick + len(episode) + schema.GAP
@@ -150,8 +162,8 @@ class EpisodeWriter:
         if self._unflushed >= FLUSH_STEPS:
             self.flush()
 
-    def _add_messages(self, episode: Episode, tick: int, row: dict[str, Any]) -> None:
-        if episode.belief is None or episode.probability is None:
+    def _add_messages(self, episode: Recording, tick: int, row: dict[str, Any]) -> None:
+        if not episode.complete:
             raise ValueError(
                 f"episode {episode.number}: without its belief; log those of `Episodes.complete`"
             )
@@ -162,9 +174,7 @@ class EpisodeWriter:
                 f"episode {episode.number}: a reward that is not finite, or a time out of range"
             )
         add, channels = self._writer.add_message, self._channels
-        steps = messages.step_messages(episode, self.run)
-        covered = None if self._coverage is None else self._coverage.cells(episode.action)
-        grids = grid_messages(episode, self.run.size, tick, covered)
+        steps, grids = self._form.steps(episode), self._form.layers(episode, tick)
         for place, (said, layers) in enumerate(zip(steps, grids, strict=True), start=tick):
             # MCAP's sequence number has 32 bits, the log time 64.
             time, sequence = time_of(place), place & 0xFFFFFFFF

@@ -15,7 +15,7 @@ from trackmdp.seeding import derive
 from trackmdp.solvers.group_chain import joint_chain
 from trackmdp.solvers.group_figures import GroupEvaluation
 from trackmdp.solvers.linear import IndexArray, accumulate, grid_of
-from trackmdp.solvers.merging import Beliefs, Clocks, Rule, switched_on
+from trackmdp.solvers.merging import Beliefs, Clocks, Rule, followed, switched_on
 from trackmdp.world.model import Array, BoolArray
 
 _FIRST = 64
@@ -144,14 +144,9 @@ class _Batch:
             report &= self.reports.random(shape) < task.detection[self.place % self.cells]
         seen = present & (report | forced[:, None])
         self._add(found, on, seen, present, before, forced)
-        sees = switched_on(on, moved.row // shape[1] * self.cells + moved.state % self.cells)
-        missed = (present & ~seen).ravel()
-        chance = np.asarray(sees * task.detects(moved.state % self.cells), dtype=np.float64)
-        left = moved.given(missed, chance, missed.size)
-        located = np.where(seen, self.place, clocks.located)
-        self.clocks = Clocks(located, np.where(seen, 0, clocks.misses + 1), present)
-        again = np.flatnonzero(seen.ravel())
-        return left.joined(Beliefs.at(again, self.place.ravel()[again]), self.states)
+        reports = present, seen
+        self.clocks, beliefs = followed(self.group, clocks, moved, on, self.place, reports)
+        return beliefs
 
     def _moved(self, before: BoolArray) -> tuple[IndexArray, BoolArray]:
         """Places after a move, and which targets are in the grid; every draw is made in every step."""

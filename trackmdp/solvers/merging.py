@@ -19,6 +19,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 
@@ -44,6 +45,10 @@ class Clocks:
     located: IndexArray
     misses: IndexArray
     present: BoolArray
+
+
+Reports: TypeAlias = tuple[BoolArray, BoolArray]
+"""`[E, K]` each: whether a target is in the grid after the step, and whether it was located."""
 
 
 @dataclass(frozen=True)
@@ -236,6 +241,31 @@ def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str = "gains")
     if merge not in kinds:
         raise UserError(f"merge={merge}: expected gains or union")
     return kinds[merge](group, tables)
+
+
+def followed(
+    group: Group, clocks: Clocks, moved: Beliefs, on: IndexArray, place: IndexArray, report: Reports
+) -> tuple[Clocks, Beliefs]:
+    """Clocks and beliefs after a step.
+
+    Args:
+        group: the targets.
+        clocks: before the step.
+        moved: beliefs after the move.
+        on: sorted numbers e · S + j of the sensors j that were on in episode e.
+        place: `[E, K]`, states of the targets after the move.
+        report: which targets are in the grid, and which were located.
+    """
+    task, (present, seen) = group.task, report
+    cell = moved.state % task.num_cells
+    sees = switched_on(on, moved.row // present.shape[1] * task.num_cells + cell)
+    missed = (present & ~seen).ravel()
+    left = moved.given(missed, np.asarray(sees * task.detects(cell), dtype=np.float64), missed.size)
+    again = np.flatnonzero(seen.ravel())
+    found = left.joined(Beliefs.at(again, place.ravel()[again]), group.kernel.shape[0])
+    # A target that has left keeps no clock.
+    misses = np.where(present & ~seen, clocks.misses + 1, 0)
+    return Clocks(np.where(seen, place, clocks.located), misses, present), found
 
 
 def switched_on(sets: IndexArray, codes: IndexArray) -> BoolArray:

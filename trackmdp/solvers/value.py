@@ -118,15 +118,23 @@ def _of_group(
     group: Group, policy: Any, *, merge: str = "gains", width: float = 0.005, seed: int = 0
 ) -> GroupEvaluation:
     """See `evaluate`."""
-    # By name, as these modules are built on this one.
+    # By name, as this module is built on this one.
+    value = import_module("trackmdp.solvers.group_value")
+    found: GroupEvaluation = value.evaluate_group(
+        group_rule(group, policy, merge), width=width, seed=seed
+    )
+    return found
+
+
+def group_rule(group: Group, policy: Any, merge: str = "gains") -> Any:
+    """The `merging.Rule` of a policy for several targets: itself, or the merged plans of single ones."""
     merging = import_module("trackmdp.solvers.merging")
+    if isinstance(policy, merging.Rule):
+        return policy
     tables = getattr(policy, "tables", None)
     if tables is None:
         tables = [_table(world, policy) for world in group.kinds]
-    rule = merging.make_rule(group, tables, merge)
-    value = import_module("trackmdp.solvers.group_value")
-    found: GroupEvaluation = value.evaluate_group(rule, width=width, seed=seed)
-    return found
+    return merging.make_rule(group, tables, merge)
 
 
 def follow(task: Task, motion: Motion, policy: PolicyTable) -> Followed:

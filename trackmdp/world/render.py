@@ -14,6 +14,10 @@ FOUND, MISSED, ON, OFF = "●", "○", "▪", "·"
 PICTURE_LEGEND = (
     f"{FOUND} target, detected   {MISSED} target, missed   {ON} sensor on   {OFF} sensor off"
 )
+NUMBERED = "⓿❶❷❸❹❺❻❼❽❾", "⓪①②③④⑤⑥⑦⑧⑨"
+"""The first of several targets, located and missed; after the tenth all are `FOUND` and `MISSED`."""
+FOUND_OF_SEVERAL = f"{NUMBERED[0][:2]} targets 0 and 1, located", f"{NUMBERED[1][:2]} missed"
+LEGEND_OF_SEVERAL = "   ".join([*FOUND_OF_SEVERAL, f"{ON} sensor on", f"{OFF} sensor off"])
 
 # Red, green, blue; distinct in grey as well, and without red.
 _COLOURS = {FOUND: (0, 90, 181), MISSED: (220, 50, 32), ON: (255, 194, 10), OFF: (238, 238, 238)}
@@ -21,12 +25,17 @@ _SIDE, _GAP = 16, 1  # pixels of a cell, and of the white line around it
 
 
 def symbols(
-    size: Sequence[int], cell: int, on: BoolArray, *, found: bool, empty: Any = OFF
+    size: Sequence[int], cell: Any, on: BoolArray, *, found: Any, empty: Any = OFF
 ) -> npt.NDArray[np.str_]:
-    """`[rows, columns]` symbols, `empty` where no sensor is on; the target's cell M, exited, is on no grid."""
-    marks = np.where(on, ON, empty)
-    if cell < len(marks):
-        marks[cell] = FOUND if found else MISSED
+    """`[rows, columns]` symbols, `empty` where no sensor is on; the target's cell M, exited, is on no grid.
+
+    Of several targets, `cell` and `found` `[K]`; of those in the same cell the first is shown.
+    """
+    marks, cells = np.where(on, ON, empty), np.atleast_1d(cell)
+    shown = zip(range(len(cells)), cells, np.atleast_1d(found), strict=True)
+    for target, place, seen in reversed([each for each in shown if each[1] < len(marks)]):
+        numbers, plain = (NUMBERED[0], FOUND) if seen else (NUMBERED[1], MISSED)
+        marks[place] = numbers[target] if len(cells) > 1 and target < len(numbers) else plain
     return marks.reshape(tuple(size))
 
 

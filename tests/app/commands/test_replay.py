@@ -24,11 +24,12 @@ from trackmdp.app.prepare import Prepared
 from trackmdp.config import world_of
 from trackmdp.episodes import schema
 from trackmdp.episodes.episode import Episode, first_difference
-from trackmdp.episodes.grids import layout as layout_of
+from trackmdp.episodes.layouts import layout as layout_of
 from trackmdp.episodes.log import EpisodeLog
-from trackmdp.episodes.player import Playing, frame, sentence
+from trackmdp.episodes.player import Playing, frame
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.schema import TABLES, LoggedRun
+from trackmdp.episodes.sentences import sentence
 from trackmdp.episodes.simulate import resimulate
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.policies.acting import Playback
@@ -211,7 +212,7 @@ def changed(
         tables = {name: reader.attachment(name) for name in TABLES}
         writer = EpisodeWriter(target, LoggedRun(reader.run.said | (run or {})), tables)
         facts = {key: value for key, value in reader.policies[0].items() if key != "table.sha256"}
-        writer.copy_policy(facts, reader.policy_table(0))
+        writer.copy_policy(facts, reader.policy_tables(0))
         for episode in reader.episodes():
             writer.add(change(episode) if episode.number == 4 else episode)
     return writer.finish()

@@ -23,6 +23,7 @@ from trackmdp.config import (
 from trackmdp.durable import write_json, write_text
 from trackmdp.episodes.batch import Episodes, Simulation
 from trackmdp.episodes.filtered import simulate_filter
+from trackmdp.episodes.group_episodes import GroupEpisodes
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.player import draw_picture
 from trackmdp.episodes.reader import EpisodeReader
@@ -154,11 +155,19 @@ def _several(
     at.print(
         f"{(upper - found.aihtr.mean) / found.expected_length:.4f} per step below the bound; results in {folder}"
     )
+    shown = (cfg.episodes if cfg.log else 0) or _FOR_THE_PICTURE
+    episodes = simulate(group, rule, shown, seed=cfg.seed)
+    write_text(folder / "picture.txt", draw_picture(episodes[:_FOR_THE_PICTURE], group.task))
+    _log(cfg, episodes, subject, folder, at)
     return found.aihtr.mean
 
 
 def _log(
-    cfg: EvaluateConfig, episodes: Episodes, subject: str, folder: Path, console: Console
+    cfg: EvaluateConfig,
+    episodes: Episodes | GroupEpisodes,
+    subject: str,
+    folder: Path,
+    console: Console,
 ) -> None:
     """Write `episodes.mcap` where it is asked for."""
     if not isinstance(mcap := cfg.log.get("mcap"), McapConfig):
@@ -169,7 +178,7 @@ def _log(
     )
     log.add(episodes, {"label": subject})
     if log.close():
-        along = " along held-out tracks" if episodes.problem.model is None else ""
+        along = " along held-out tracks" if isinstance(episodes.problem, Recorded) else ""
         console.print(f"{log.episodes} episodes{along} in {log.file}")
 
 

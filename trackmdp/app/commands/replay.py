@@ -9,13 +9,14 @@ from rich.console import Console
 
 from trackmdp.config import ReplayConfig
 from trackmdp.episodes.extracts import write_page, write_tables
-from trackmdp.episodes.grids import write_layout
+from trackmdp.episodes.layouts import write_layout
 from trackmdp.episodes.player import play
 from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
 from trackmdp.episodes.schema import versions_apart
 from trackmdp.errors import RunError, UserError
 from trackmdp.training.display import make_console, table
+from trackmdp.world.group import Group
 
 
 def run(cfg: ReplayConfig, folder: Path) -> None:  # noqa: ARG001  every file has a name of its own
@@ -44,7 +45,9 @@ def run(cfg: ReplayConfig, folder: Path) -> None:  # noqa: ARG001  every file ha
         if cfg.episode is None:
             _list(console, reader)
         else:
-            play(console, reader.read(cfg.episode), reader.world(), cfg.speed)
+            world = reader.world()
+            task = world.task if isinstance(world, Group) else world
+            play(console, reader.read(cfg.episode), task, cfg.speed)
 
 
 def _exports(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> bool:
@@ -54,7 +57,7 @@ def _exports(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> bool
     writers: list[tuple[str, str | None, Callable[[Path], object]]] = [
         ("html", cfg.html, lambda path: write_page(reader, path, cfg.episode)),
         ("csv", cfg.csv, lambda path: write_tables(reader, path, cfg.episode)),
-        ("layout", cfg.layout, lambda path: write_layout(path, reader.run.size)),
+        ("layout", cfg.layout, lambda path: write_layout(path, reader.run)),
     ]
     for key, path, write in writers:
         if path is None:
@@ -84,6 +87,8 @@ def _list(console: Console, reader: EpisodeReader) -> None:
     total = sum(row["length"] for row in reader.rows)
     (rows, columns), seed = reader.run.size, reader.run.said.get("seed", "")
     grid = f"{rows}x{columns} grid"
+    if reader.run.kinds:
+        grid += f" with {len(reader.run.kinds)} targets"
     console.print(
         f"{len(reader)} episodes, {total:,} steps on a {grid}, T_max {reader.run.t_max}, seed {seed}"
     )

@@ -1,0 +1,47 @@
+"""Random numbers of simulated episodes, each episode's from generators of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from trackmdp.seeding import derive
+
+_BLOCK = 256  # draws taken from an episode's generator at a time; part of the meaning of a seed, so never to be changed
+
+
+class Draws:
+    """Draws of many episodes, each from a generator of its own, `_BLOCK` steps at a time.
+
+    Args:
+        seeds: of the episodes.
+        draw: so many draws of a generator, `[count, ...]`.
+        names: of the generators, derived from the seeds.
+    """
+
+    _block: Tensor
+
+    def __init__(
+        self, seeds: Sequence[int], draw: Callable[[int, torch.Generator], Tensor], *names: str
+    ) -> None:
+        # A generator for each episode, not one for the batch: its draws must not depend on how many others
+        # run beside it, nor on when they end.
+        seeds = [derive(seed, *names) for seed in seeds] if names else seeds
+        self.generators, self._draw = [torch.Generator().manual_seed(seed) for seed in seeds], draw
+
+    def at(self, row: Tensor, step: int) -> Tensor:
+        """`[R, ...]`, those of the running episodes `row` `[R]` at their step."""
+        place = step % _BLOCK
+        # At steps 0, 256, 512, ...: all running episodes are at the same step, and refill together; ended ones draw no
+        # more.
+        if place == 0:
+            drawn = torch.stack(
+                [self._draw(_BLOCK, self.generators[each]) for each in row.tolist()]
+            )
+            if step:
+                self._block[row] = drawn
+            else:
+                self._block = drawn
+        return self._block[row, place]

@@ -1,0 +1,119 @@
+"""Simulated episodes of several targets; see `Episodes`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import cast, overload
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from trackmdp.episodes.group_episode import GroupEpisode
+from trackmdp.episodes.group_simulate import AT_ONCE, group_episodes
+from trackmdp.episodes.showing import Showing
+from trackmdp.notebook.card import Card, grid_words
+from trackmdp.solvers.group_figures import GroupEvaluation, with_ends
+from trackmdp.solvers.group_value import known_mean, known_rewards
+from trackmdp.solvers.merging import Rule
+from trackmdp.world.group import Group
+from trackmdp.world.model import Array
+
+_BELIEFS = 2**22
+"""Numbers of the beliefs that are kept together, at most, if a target may be in 30 cells in each of 100 steps."""
+
+
+class GroupEpisodes(Showing, Sequence[GroupEpisode]):
+    """The episodes of one policy for several targets; a sequence of `GroupEpisode`.
+
+    Args:
+        policy: for several targets.
+        seeds: of each of the E episodes.
+    """
+
+    def __init__(self, policy: Rule, seeds: Sequence[int]) -> None:
+        self.policy, self.seeds = policy, list(seeds)
+
+    @property
+    def problem(self) -> Group:
+        """Where they took place."""
+        return self.policy.group
+
+    @cached_property
+    def _made(self) -> list[GroupEpisode]:
+        return [*_numbered(group_episodes(self.policy, self.seeds), 0)]
+
+    def __len__(self) -> int:
+        return len(self.seeds)
+
+    @overload
+    def __getitem__(self, which: int) -> GroupEpisode: ...
+    @overload
+    def __getitem__(self, which: slice) -> list[GroupEpisode]: ...
+    def __getitem__(self, which: int | slice) -> GroupEpisode | list[GroupEpisode]:
+        return self._made[which]
+
+    def card(self) -> Card:
+        """Number of episodes and targets, and their figures with intervals."""
+        task, steps = self.problem.task, sum(map(len, self._made))
+        facts = {"targets": f"{len(self.problem)}", "steps": f"{steps:,}"}
+        facts["problem"] = f"Group, {grid_words(task.size)}, T_max {task.t_max}"
+        if len(self) > 1:
+            found = self.figures()
+            for name in ("aihtr", "accuracy", "sensors_per_step", "safe_per_step"):
+                facts[name.replace("_", " ")] = with_ends(getattr(found, name))
+        return Card(f"Episodes: {len(self):,} (figures: 95 % intervals)", facts)
+
+    def figures(self) -> GroupEvaluation:
+        """The policy's figures from the episodes, with 95 % intervals."""
+        group = self.problem
+        totals = np.array([self._totals(each) for each in self._made])
+        controls = group.target_steps, known_mean(self.policy)
+        return GroupEvaluation(totals.reshape(-1, 7), False, group.expected_steps, controls)
+
+    @cached_property
+    def _known(self) -> Array:
+        return np.stack(known_rewards(self.policy))
+
+    def _totals(self, episode: GroupEpisode) -> list[float]:
+        """A row of `GroupEvaluation`."""
+        cells, kind = self.problem.task.num_cells, self.problem.kind
+        inside = episode.target < cells
+        before = np.concatenate([episode.start[None], episode.target[:-1]])
+        known = np.where(before < cells, self._known[kind, np.minimum(before, cells - 1)], 0.0)
+        forced, some = episode.forced(self.problem.task.t_max), inside.any(axis=1)
+        on = episode.action.sum(axis=1) * some
+        counts = (inside, episode.located, on, forced & some)
+        return [
+            float(episode.returns[-1]),
+            *(float(each.sum()) for each in counts),
+            float(len(episode)),
+            float(known.sum()),
+        ]
+
+    def complete(self) -> Iterator[GroupEpisode]:
+        """The episodes with `belief`, simulated once more, a bounded number of them at a time."""
+        each = max(1, min(AT_ONCE, _BELIEFS // 3000) // len(self.problem))
+        for begin in range(0, len(self), each):
+            seeds = self.seeds[begin : begin + each]
+            yield from _numbered(group_episodes(self.policy, seeds, beliefs=True), begin)
+
+    def shown(self, call: str, number: int) -> GroupEpisode:
+        """See `Showing`."""
+        self.check(call, number)
+        (episode,) = group_episodes(self.policy, self.seeds[number : number + 1], beliefs=True)
+        return replace(episode, number=number)
+
+    def to_tensordict(self) -> TensorDict:
+        """`[S]` the steps of all episodes, as of `GroupEpisode.to_tensordict`, and the number of each, `episode`."""
+        parts = [
+            each.to_tensordict(self.problem.task).set("episode", torch.full((len(each),), number))
+            for number, each in enumerate(self)
+        ]
+        return cast(TensorDict, torch.cat(parts)) if parts else TensorDict({}, [0])
+
+
+def _numbered(episodes: Sequence[GroupEpisode], begin: int) -> Iterator[GroupEpisode]:
+    return (replace(each, number=begin + place) for place, each in enumerate(episodes))

@@ -1,0 +1,160 @@
+"""Simulating episodes of several targets, each from its own generators; see `simulate`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import sparse
+from torch import Tensor
+
+from trackmdp.episodes.episode_draws import Draws
+from trackmdp.episodes.group_episode import GroupEpisode
+from trackmdp.solvers.linear import IndexArray
+from trackmdp.solvers.merging import Beliefs, Clocks, Rule, followed
+from trackmdp.world.model import BoolArray
+from trackmdp.world.outcomes import Costs
+from trackmdp.world.paths import PathSampler
+
+AT_ONCE = 4096
+"""Targets of the episodes that are stepped together; 256 steps of their draws are held, 8 MB."""
+
+
+@torch.no_grad()
+def group_episodes(
+    rule: Rule, seeds: Sequence[int], *, beliefs: bool = False
+) -> list[GroupEpisode]:
+    """One episode for each of `seeds`, in their order; each independent of the others.
+
+    Args:
+        rule: the policy, and its targets.
+        seeds: of the episodes.
+        beliefs: whether beliefs are kept.
+    """
+    each, sampler = max(1, AT_ONCE // len(rule.group)), PathSampler(rule.group.kernel)
+    return [
+        episode
+        for begin in range(0, len(seeds), each)
+        for episode in _Batch(rule, sampler, seeds[begin : begin + each], beliefs).run()
+    ]
+
+
+class _Batch:
+    """E episodes stepped together until the last one has ended."""
+
+    def __init__(
+        self, rule: Rule, sampler: PathSampler, seeds: Sequence[int], beliefs: bool
+    ) -> None:
+        self._rule, self._group, self._sampler = rule, rule.group, sampler
+        self._task, self._costs, self._seeds = rule.task, Costs(rule.task), seeds
+        self._shape = len(seeds), len(rule.group)
+        targets = len(rule.group)
+        # As with one target, moves and reports apart, so that two policies with one seed meet the same targets.
+        self._moves, self._seen = Draws(seeds, self._move_draws), None
+        if not rule.task.perfect:
+            double = torch.float64
+            self._seen = Draws(
+                seeds,
+                lambda count, rng: torch.rand(count, targets, dtype=double, generator=rng),
+                "report",
+            )
+        self._taken: list[dict[str, Any]] = []
+        self._kept: list[Beliefs] | None = [] if beliefs else None
+
+    def _move_draws(self, count: int, rng: torch.Generator) -> Tensor:
+        return self._sampler.draw(count * self._shape[1], rng).view(count, self._shape[1])
+
+    def run(self) -> list[GroupEpisode]:
+        """Step until the last target of the last episode has left."""
+        cells, shape = self._task.num_cells, self._shape
+        starts = [
+            torch.randint(cells, shape[1:], generator=rng).numpy() for rng in self._moves.generators
+        ]
+        place: IndexArray = np.stack(starts) + self._group.kind * cells
+        clocks = Clocks(place, np.zeros(shape, np.int64), np.ones(shape, dtype=bool))
+        beliefs, step = Beliefs.at(np.arange(place.size), place.ravel()), 0
+        while len(row := np.flatnonzero(clocks.present.any(axis=1))):
+            place, clocks, beliefs = self._step(row, step, place, clocks, beliefs)
+            step += 1
+        row = np.concatenate([step.pop("row") for step in self._taken])
+        # In order of time; a stable sort by episode leaves them so within each.
+        order, ends = np.argsort(row, kind="stable"), np.cumsum(np.bincount(row))[:-1]
+        columns = {
+            name: np.split(np.concatenate([step[name] for step in self._taken])[order], ends)
+            for name in self._taken[0]
+        }
+        return [
+            self._episode(number, start, {name: column[number] for name, column in columns.items()})
+            for number, start in enumerate(starts)
+        ]
+
+    def _step(
+        self, row: IndexArray, step: int, place: IndexArray, clocks: Clocks, beliefs: Beliefs
+    ) -> tuple[IndexArray, Clocks, Beliefs]:
+        """One step of `TrackEnv`; the same order of events, the same arithmetic."""
+        task, cells, states = self._task, self._task.num_cells, self._group.kernel.shape[0]
+        moved = beliefs.moved(self._group)
+        late: BoolArray = np.any(clocks.present & (clocks.misses > task.t_max), axis=1)
+        on = self._rule.sets(clocks, moved)
+        on = on[~late[on // cells]]
+        action = np.zeros((self._shape[0], cells), dtype=bool)
+        action.ravel()[on] = True
+        draws = torch.zeros(self._shape, dtype=torch.int64)
+        draws[row] = self._moves.at(torch.from_numpy(row), step)
+        after = self._sampler.move(torch.from_numpy(place.ravel()), draws.view(-1)).numpy()
+        place = after.reshape(self._shape)
+        present = clocks.present & (place < states)
+        cell = np.where(present, place % cells, 0)
+        report = np.take_along_axis(action, cell, axis=1)
+        if self._seen is not None:
+            chance = np.ones(self._shape)
+            chance[row] = self._seen.at(torch.from_numpy(row), step).numpy()
+            report &= chance < task.detection[cell]
+        seen = present & (report | late[:, None])
+        columns = {"misses": clocks.misses, "action": np.packbits(action, axis=1), "located": seen}
+        columns["target"] = np.where(present, cell, cells)
+        columns["reward"] = self._reward(action, seen, late, present)
+        self._taken.append({name: column[row] for name, column in columns.items()} | {"row": row})
+        if self._kept is not None:
+            self._kept.append(moved)
+        return place, *followed(self._group, clocks, moved, on, place, (present, seen))
+
+    def _reward(
+        self, action: BoolArray, seen: BoolArray, late: BoolArray, present: BoolArray
+    ) -> Any:
+        """`[E]` float32."""
+        spent = self._costs.price_of(torch.from_numpy(action))
+        spent = torch.where(torch.from_numpy(late), self._task.safe_cost, spent)
+        spent = spent * torch.from_numpy(present.any(axis=1))
+        return (self._task.reward * torch.from_numpy(seen).sum(-1) - spent).float().numpy()
+
+    def _episode(self, number: int, start: IndexArray, columns: dict[str, Any]) -> GroupEpisode:
+        count = self._task.total_sensors
+        columns["action"] = np.unpackbits(columns["action"], axis=1, count=count).astype(bool)
+        return GroupEpisode(
+            number=number,
+            seed=self._seeds[number],
+            policy=0,
+            start=start.astype(np.int64),
+            terminated=True,
+            belief=self._belief(number, len(columns["reward"])),
+            **columns,
+        )
+
+    def _belief(self, number: int, steps: int) -> sparse.csr_array | None:
+        """`[T · K, M]` beliefs of an episode, predicted in each of its steps."""
+        if self._kept is None:
+            return None
+        targets, cells = self._shape[1], self._task.num_cells
+        first, rows, columns, masses = number * targets, list[Any](), list[Any](), list[Any]()
+        for t, moved in enumerate(self._kept[:steps]):
+            mine = slice(*np.searchsorted(moved.row, [first, first + targets]))
+            rows.append(moved.row[mine] - first + t * targets)
+            columns.append(moved.state[mine] % cells)
+            masses.append(moved.mass[mine].astype(np.float32))
+        entries = np.concatenate(masses), (np.concatenate(rows), np.concatenate(columns))
+        belief = sparse.csr_array(entries, shape=(steps * targets, cells))
+        belief.eliminate_zeros()
+        return belief
