@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import tracemalloc
 
 import numpy as np
 import pytest
 from scipy import sparse
 
-from trackmdp.algos.estimates import censored
+from trackmdp.algos.estimates import censored, kernel_estimate
 from trackmdp.algos.estimates.censored import ObservedPaths, expected_moves
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.world.model import Array
@@ -115,9 +116,41 @@ def test_every_round_makes_what_was_seen_more_likely() -> None:
 def test_paths_taken_part_by_part_give_the_same_moves(monkeypatch: pytest.MonkeyPatch) -> None:
     paths, kernel = paths_of(simulated(200, 0)), sparse.csr_array(np.full((4, 5), 0.2))
     whole = expected_moves(kernel, paths, np.ones(200)).toarray()
-    monkeypatch.setattr(censored, "_TOGETHER", 7)
+    monkeypatch.setattr(censored, "_ENTRIES", 30)
     apart = expected_moves(kernel, paths, np.ones(200)).toarray()
     np.testing.assert_allclose(apart, whole, rtol=1e-12)
+
+
+def test_paths_that_exit_need_memory_for_the_cells_where_they_may_be_alone() -> None:
+    """On a line of 100,000 cells the target steps to the right or exits; 300 times it was missed once, then left."""
+    cells, paths = 100_000, 300
+    moves = sparse.diags_array(np.full(cells - 1, 0.9), offsets=1, shape=(cells, cells))
+    leave = sparse.csr_array(np.full((cells, 1), 0.1))
+    kernel = sparse.csr_array(sparse.hstack([moves, leave], format="csr"))
+    seen = ObservedPaths(
+        np.arange(paths),
+        np.ones(paths, int),
+        sparse.csr_array((paths, cells)),
+        np.full(paths, cells),
+    )
+    tracemalloc.start()
+    expected = expected_moves(kernel, seen, np.ones(paths))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_allclose(expected[:paths, 1 : paths + 1].diagonal(), 1.0)
+    np.testing.assert_allclose(expected[1 : paths + 1, [cells]].toarray(), 1.0)
+    assert expected.sum() == pytest.approx(2 * paths)
+    assert peak < 2**26  # a number for each path and cell would be 2^28 bytes
+
+
+def test_displacements_are_put_down_part_by_part_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The typical moves of all cells do not depend on how many are worked on at once."""
+    estimate = KernelEstimate((5, 7), weight=1.0, exit_weight=1.0)
+    rng = np.random.default_rng(0)
+    estimate.add_moves(rng.integers(35, size=40), rng.integers(36, size=40))
+    whole = estimate.mean().toarray()
+    monkeypatch.setattr(kernel_estimate, "_PLACES", 100)
+    np.testing.assert_array_equal(estimate.mean().toarray(), whole)
 
 
 def test_sets_that_never_show_some_moves_still_tell_them() -> None:

@@ -13,9 +13,11 @@ from trackmdp.solvers.linear import IndexArray, row_index
 from trackmdp.world.model import Array, BoolArray
 
 _AT_ONCE = 2**14
-"""Paths with hidden cells that are gone through at once."""
-_TOGETHER = 2**16
-"""Paths of which expected moves are added at once: where sensors miss, each takes some 30 kB."""
+"""Paths with hidden cells that are drawn at once."""
+_ENTRIES = 2**23
+"""Cells where paths may be, and pairs of such cells, that are worked on at once: some 100 MB an array."""
+_SAMPLE = 64
+"""Paths from which the cells of all others are reckoned."""
 
 
 @dataclass(frozen=True)
@@ -116,34 +118,101 @@ def expected_moves(
     With f_t the undetected mass and l_t the likelihood of the later observations, the move i -> j at step t of
     a path is made with probability f_t(i) P_ij l_{t+1}(j) / (likelihood of the path); P_ij is multiplied in at the end.
     """
-    m = kernel.shape[0]
-    moves, backward = sparse.csr_array(kernel[:, :-1]), sparse.csr_array(kernel.T)
-    expected = sparse.csr_array(kernel.shape)
-    for n, ends, part in _parts(paths, paths.end <= m):
+    m, made = kernel.shape[0], _OnEntries(kernel)
+    moves, backward, leave = _directions(kernel)
+    for n, ends, part in _parts(moves, paths, paths.end <= m):
         some, each = paths.pick(part), np.arange(len(part))
         sensed = some.sets(n)
         forward = _forward(moves, some, sensed)
-        # row `end` of P^T is the likelihood of ending there, by the cell before; 1 at all cells if the end is unknown
-        later = backward[some.end] if ends else (forward[n] > 0).astype(np.float64)
+        # 1 at all cells if the end is unknown
+        later = _ending(backward, leave, forward[n], some.end) if ends else _support(forward[n])
         weight = copies[part] / np.maximum(forward[n].multiply(later).sum(axis=1), 1e-300)
         if ends:
             # The last move ends in the known cell, or in the exit, column M: f_n(i) at (i, end), weighted.
-            expected = expected + forward[n].T @ counted(each, some.end, weight, (len(part), m + 1))
+            made.add(forward[n], counted(each, some.end, weight, (len(part), m + 1)))
         for t in range(n - 1, -1, -1):
             later = _hidden(later, sensed[t])
-            moved = sparse.csr_array(forward[t].T @ (sparse.diags_array(weight) @ later))
-            expected = expected + sparse.hstack([moved, sparse.csr_array((m, 1))], format="csr")
+            made.add(forward[t], sparse.csr_array(sparse.diags_array(weight) @ later))
             # l_t(i) = sum_j P_ij l_{t+1}(j), with l zero where the cell was sensed: there it would have been detected.
-            later = later @ moves.T
-    return sparse.csr_array(sparse.csr_array(expected).multiply(kernel))
+            later = sparse.csr_array((later @ moves.T).multiply(_support(forward[t])))
+    return made.matrix()
 
 
-def _parts(paths: ObservedPaths, seen: BoolArray) -> Iterator[tuple[int, bool, IndexArray]]:
-    """Paths with as many misses, their ends seen or not: n, whether, and their numbers."""
+class _OnEntries:
+    """Sums over paths at the stored entries of a kernel `[M, M + 1]` alone: all other moves have probability 0."""
+
+    def __init__(self, kernel: sparse.csr_array) -> None:
+        self._kernel = kernel if kernel.has_sorted_indices else kernel.sorted_indices()
+        self._sums = np.zeros(kernel.nnz)
+
+    def add(self, before: sparse.csr_array, after: sparse.csr_array) -> None:
+        """Add at (i, j) the sum over the paths k of before(k, i) after(k, j): `[K, M]` and `[K, M]` or `[K, M + 1]`."""
+        pairs = sparse.csr_array(before.T) @ after
+        rows = np.flatnonzero(np.diff(pairs.indptr))
+        # The entries of these rows of the kernel, and their numbers.
+        some, count = self._kernel[rows], np.diff(self._kernel.indptr)[rows]
+        entry = np.repeat(self._kernel.indptr[rows] - some.indptr[:-1], count) + np.arange(some.nnz)
+        pairs = pairs[rows]
+        pairs.resize(some.shape)
+        some.data[:] = 1.0
+        found = sparse.csr_array(pairs.multiply(some))
+        width = some.shape[1]
+        place = np.searchsorted(
+            row_index(some) * width + some.indices, row_index(found) * width + found.indices
+        )
+        self._sums[entry[place]] += found.data
+
+    def matrix(self) -> sparse.csr_array:
+        """`[M, M + 1]` the sums times the kernel."""
+        kernel = self._kernel
+        parts = (self._sums * kernel.data, kernel.indices, kernel.indptr)
+        total = sparse.csr_array(parts, shape=kernel.shape, copy=True)
+        total.eliminate_zeros()
+        return total
+
+
+def _directions(kernel: sparse.csr_array) -> tuple[sparse.csr_array, sparse.csr_array, Array]:
+    """Of a kernel `[M, M + 1]`: moves `[M, M]`, by their ends `[M + 1, M]` with nothing at M, and exits `[M]`."""
+    m = kernel.shape[0]
+    moves = sparse.csr_array(kernel[:, :-1])
+    backward = sparse.csr_array(moves.T)
+    backward.resize((m + 1, m))
+    return moves, backward, kernel[:, [m]].toarray().ravel()
+
+
+def _ending(
+    backward: sparse.csr_array, leave: Array, forward: sparse.csr_array, end: IndexArray
+) -> sparse.csr_array:
+    """`[K, M]` probability of the end of each path from each cell where it may be, in `forward`."""
+    support = _support(forward)
+    # From every cell the target may exit: row M of the transposed kernel is dense, but a path is in few cells.
+    gone = sparse.diags_array((end == len(leave)).astype(np.float64))
+    left = gone @ support @ sparse.diags_array(leave)
+    return sparse.csr_array(backward[end].multiply(support) + left)
+
+
+def _support(mass: sparse.csr_array) -> sparse.csr_array:
+    """1 where there is mass."""
+    return sparse.csr_array(mass > 0).astype(np.float64)
+
+
+def _parts(
+    moves: sparse.csr_array, paths: ObservedPaths, seen: BoolArray
+) -> Iterator[tuple[int, bool, IndexArray]]:
+    """Paths with as many misses, their ends seen or not: n, whether, and their numbers, `_ENTRIES` at once."""
     for n, ends in itertools.product(np.unique(paths.misses), (True, False)):
         whole = np.flatnonzero((paths.misses == n) & (seen == ends))
-        for begin in range(0, len(whole), _TOGETHER):
-            yield int(n), ends, whole[begin : begin + _TOGETHER]
+        if not len(whole):
+            continue
+        some = paths.pick(whole[:: max(1, len(whole) // _SAMPLE)])
+        cells = np.array([np.diff(mass.indptr) for mass in _forward(moves, some, some.sets(n))])
+        entries = cells.sum(axis=0)
+        # Pairs of all paths are no more than those of all cells.
+        if moves.shape[0] ** 2 > _ENTRIES:
+            entries = np.maximum(entries, (cells[:-1] * cells[1:]).max(axis=0, initial=0))
+        count = max(1, int(_ENTRIES / max(1.0, entries.mean())))
+        for begin in range(0, len(whole), count):
+            yield int(n), ends, whole[begin : begin + count]
 
 
 def _forward(
@@ -166,7 +235,7 @@ def hidden_cells(
     Forward filtering, backward sampling: the last hidden cell i is drawn in proportion to f_n(i) P_ij, j the end, and
     each earlier one alike, given the one after it. All ends are known.
     """
-    moves, backward = sparse.csr_array(kernel[:, :-1]), sparse.csr_array(kernel.T)
+    moves, backward, leave = _directions(kernel)
     place = np.cumsum(paths.misses) - paths.misses
     found = np.empty(int(paths.misses.sum()), dtype=np.int64)
     for n in np.unique(paths.misses[paths.misses > 0]):
@@ -176,7 +245,8 @@ def hidden_cells(
             some = paths.pick(part)
             forward, after = _forward(moves, some, some.sets(n)), some.end
             for t in range(n, 0, -1):
-                likely = sparse.csr_array(forward[t].multiply(backward[after]))
+                later = _ending(backward, leave, forward[t], after)
+                likely = sparse.csr_array(forward[t].multiply(later))
                 after = drawn_columns(likely, some.start, rng)
                 found[place[part] + t - 1] = after
     return found

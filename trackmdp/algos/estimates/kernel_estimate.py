@@ -27,7 +27,8 @@ LEAST_EXIT = 1e-9
 """Exit probability of a kernel drawn from the posterior, at least."""
 NEGLIGIBLE = 1e-3
 """Expected counts below this are dropped, so that the counts stay sparse."""
-
+_PLACES = 2**22
+"""Displacements put down at once: some 32 MB an array."""
 
 SELDOM = 0.1
 """Where a smaller share of the pairs so far apart was seen as moves, those moves come from a mixture of their own."""
@@ -321,15 +322,18 @@ class KernelEstimate:
         self, rows: IndexArray, columns: IndexArray, weight: Array, begin: IndexArray | None = None
     ) -> sparse.csr_array:
         """`[M, M]` displacements `[S]` from every cell, or those of class `begin` `[S]`, but for ends outside."""
-        cells = np.arange(self.num_cells)
-        row, column = cells[:, None] // self.columns + rows, cells[:, None] % self.columns + columns
-        inside = (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
-        if begin is not None:
-            inside &= cells[:, None] % self._modes == begin
-        # [M, S] in row-major order, as `end` below lists its entries.
-        start, which = np.nonzero(inside)
-        end = (row * self.columns + column)[inside]
-        return counted(start, end, weight[which], (self.num_cells, self.num_cells))
+        parts, count = [], max(1, _PLACES // max(1, len(weight)))
+        for first in range(0, self.num_cells, count):
+            cells = np.arange(first, min(first + count, self.num_cells))[:, None]
+            row, column = cells // self.columns + rows, cells % self.columns + columns
+            inside = (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
+            if begin is not None:
+                inside &= cells % self._modes == begin
+            # [cells, S] in row-major order, as `end` below lists its entries.
+            start, which = np.nonzero(inside)
+            end = (row * self.columns + column)[inside]
+            parts.append(counted(start, end, weight[which], (len(cells), self.num_cells)))
+        return sparse.csr_array(sparse.vstack(parts, format="csr"))
 
     def _farthest(self, moved: sparse.csr_array) -> int:
         """Rows or columns of the farthest move seen, at least 1."""
