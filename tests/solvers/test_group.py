@@ -166,7 +166,6 @@ def test_bracket_of_two_targets_on_six_by_six_is_narrow() -> None:
             "episodes=5: without effect",
         ),
         (["evaluate", "baseline=qmdp", "evaluation.width=1"], "without effect"),
-        (["train", "targets.count=2"], "targets.count: unknown option"),
     ],
 )
 def test_words_without_effect_are_refused(

@@ -109,5 +109,3 @@ def test_what_several_targets_do_not_have_is_refused() -> None:
         env.render()
     with pytest.raises(UserError, match="5 sensors on, expected at most the budget, 1"):
         env.step(env.reset().set("action", torch.arange(18).view(2, 9) % 2 == 0))
-    with pytest.raises(UserError, match="the first argument is a Group"):
-        tm.train(group, "a2c")  # type: ignore[arg-type]

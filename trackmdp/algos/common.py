@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from inspect import signature
 from typing import Any, ClassVar, Protocol
 
@@ -51,7 +51,11 @@ class Algorithm(Protocol):
 
 
 def make_algorithm(
-    cfg: TrainConfig, task: Task, device: torch.device, nets: Mapping[str, Any] | None = None
+    cfg: TrainConfig,
+    task: Task,
+    device: torch.device,
+    nets: Mapping[str, Any] | None = None,
+    targets: Sequence[int] = (),
 ) -> Algorithm:
     """The learner that a config names; it is given the task, never the motion.
 
@@ -60,6 +64,7 @@ def make_algorithm(
         task: the task.
         device: where the networks live.
         nets: `actor` and `critic` of the user's own.
+        targets: kind of each target, where it learns of several together.
 
     Raises:
         UserError: the learner takes no such networks.
@@ -70,6 +75,8 @@ def make_algorithm(
     # Rounded up: 100,001 frames in batches of 10,000 are 11 iterations, the last one whole as well.
     batches = -(-cfg.collector.total_frames // cfg.collector.frames_per_batch)
     given = {"iterations": batches, "seed": cfg.seed, "device": device} | dict(nets or {})
+    if targets:
+        given["targets"] = targets
     return made(task.task, cfg.algo, **given)
 
 

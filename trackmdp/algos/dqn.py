@@ -156,16 +156,23 @@ class DQN(Checkpointed):
     parts: ClassVar[tuple[str, ...]] = ("loss", "optimizer", "buffer", "explore", "iteration")
 
     def __init__(
-        self, task: Task, cfg: DqnConfig, *, iterations: int, seed: int, device: torch.device
+        self,
+        task: Task,
+        cfg: DqnConfig,
+        *,
+        iterations: int,
+        seed: int,
+        device: torch.device,
+        targets: Sequence[int] = (),
     ) -> None:
         self.cfg, self.iterations, self.iteration, self.device = cfg, iterations, 0, device
-        qvalue = make_qvalue(task, cfg.hidden, cfg.reward_scale).to(device)
+        qvalue = make_qvalue(task, cfg.hidden, cfg.reward_scale, targets).to(device)
         self.budget = task.budget
         self.explore = EpsilonFlip(cfg.epsilon.start, qvalue.module.units, task.budget).to(device)
         self.policy = TensorDictSequential(qvalue, self.explore)
         self.loss = AdditiveDQNLoss(qvalue, task.budget)
         self.target = SoftUpdate(self.loss, tau=cfg.target_tau)
-        self.slow = make_qvalue(task, cfg.hidden, cfg.reward_scale).to(device)
+        self.slow = make_qvalue(task, cfg.hidden, cfg.reward_scale, targets).to(device)
         self.parameters = list(qvalue.parameters())
         self.optimizer = torch.optim.Adam(self.parameters, lr=cfg.learning_rate.start, fused=True)
         per = cfg.prioritized

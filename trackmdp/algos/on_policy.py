@@ -11,7 +11,7 @@ actor of one's own may have other distributions; for it, prices are as paid.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -29,6 +29,7 @@ from trackmdp.algos.common import (
     set_learning_rate,
 )
 from trackmdp.config.learning import ActorCriticConfig, PpoConfig
+from trackmdp.policies.joint_nets import last_clock
 from trackmdp.policies.nets import make_actor, make_critic
 from trackmdp.seeding import generator
 from trackmdp.world.model import Task
@@ -58,14 +59,15 @@ class OnPolicy(Checkpointed):
         iterations: int,
         seed: int,
         device: torch.device,
+        targets: Sequence[int] = (),
         actor: TensorDictModuleBase | None = None,
         critic: TensorDictModuleBase | None = None,
     ) -> None:
-        self.cfg, self._t_max = cfg, task.t_max
+        self.cfg, self._t_max, self._targets = cfg, task.t_max, targets
         self.iterations, self.iteration, self.device = iterations, 0, device
-        own = actor or make_actor(task, cfg.hidden, cfg.initial_logit)
+        own = actor or make_actor(task, cfg.hidden, cfg.initial_logit, targets)
         self.policy = own.to(device)
-        self.critic = (critic or make_critic(task, cfg.hidden)).to(device)
+        self.critic = (critic or make_critic(task, cfg.hidden, targets)).to(device)
         self.parameters = [*self.policy.parameters(), *self.critic.parameters()]
         self.optimizer = torch.optim.Adam(
             self.parameters, lr=cfg.learning_rate.start, eps=1e-5, fused=True
@@ -123,8 +125,8 @@ class OnPolicy(Checkpointed):
         rate, entropy = self.cfg.learning_rate.at(progress), self.cfg.entropy.at(progress)
         set_learning_rate(self.optimizer, rate)
         self.loss.entropy_coeff.fill_(entropy)
-        paid = (batch["steps_since_detection"] <= self._t_max).unsqueeze(-1)
-        paid = paid & ~batch["next", "terminated"]
+        clock = last_clock(batch["steps_since_detection"], self._targets).unsqueeze(-1)
+        paid = (clock <= self._t_max) & ~batch["next", "terminated"]
         reward = batch["next", "reward"]
         if self.costs is not None:
             expected = self.policy.build_dist_from_params(batch).mean
@@ -135,11 +137,9 @@ class OnPolicy(Checkpointed):
         with torch.no_grad():
             self.advantage(batch)
         fit = explained_variance(batch["state_value"], batch["value_target"]).item()
-        seen = {*self.critic.in_keys, *self.policy.in_keys, "steps_since_detection"}
+        seen = {*self.critic.in_keys, *self.policy.in_keys}
         data = batch.select(*sorted(seen), *_KEPT, strict=False).reshape(-1)
-        data["advantage"], unit = _normalised(
-            data["advantage"], data["steps_since_detection"].unsqueeze(-1), self._t_max
-        )
+        data["advantage"], unit = _normalised(data["advantage"], clock.reshape(-1, 1), self._t_max)
         data["price_weight"] = unit * paid.reshape(-1, 1) * self.cfg.reward_scale
         return data, {"learning_rate": rate, "entropy_coef": entropy, "explained_variance": fit}
 

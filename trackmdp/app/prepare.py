@@ -24,7 +24,7 @@ from trackmdp.errors import UserError
 from trackmdp.imports import importing
 
 if TYPE_CHECKING:
-    from trackmdp.world.tracks import Problem
+    from trackmdp.world.group import Subject
 
 WORLD_KEYS = ("grid", "kernel", "cost", "sensor")
 
@@ -66,7 +66,7 @@ class Prepared:
     command: str
     cfg: CommandConfig
     folder: Path
-    problem: Problem | None = None
+    problem: Subject | None = None
 
     def run(self) -> Any:
         """Run the command; returns its result."""
@@ -170,7 +170,7 @@ def _reads_files(cfg: WorldConfig) -> bool:
     return not exits or any(isinstance(table, str) for table in tables)
 
 
-def _problem(cfg: WorldConfig, folder: Path) -> Problem:
+def _problem(cfg: WorldConfig, folder: Path) -> Subject:
     """The world or the tracks of `cfg`; those of a run that `folder` holds already are read from there."""
     # Imported here: scipy takes longer than all other checks.
     if isinstance(cfg, TrainConfig):

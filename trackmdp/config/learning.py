@@ -69,6 +69,8 @@ class AlgoConfig(ChoiceConfig):
     """Whether sensors may cover several cells."""
     knows_budget: ClassVar[bool] = False
     """Whether no more sensors than the budget are on, also while learning."""
+    joint: ClassVar[bool] = False
+    """Whether it learns of several targets together; else of a single one, and plans are merged."""
     total_frames: int = option("env steps the algorithm needs", unit="frames", ge=1, le=MOST_FRAMES)
     frames_per_batch: int = option("env steps per collected batch", unit="frames", ge=1)
     envs: int = option("environments stepped together", ge=1)
@@ -86,6 +88,7 @@ class NetworkConfig(EveryTaskConfig):
     """Common options of the algorithms with networks that learn from their own sensing."""
 
     knows_budget: ClassVar[bool] = True
+    joint: ClassVar[bool] = True
     gamma: float = option(
         "discount while learning; policies are evaluated undiscounted", ge=0, le=1
     )

@@ -43,7 +43,7 @@ class WorldConfig(CommandConfig):
         return {} if task is None else {"memory": task.memory, "clip": task.clip}
 
 
-class EvaluationConfig(NodeConfig):
+class EvaluationConfig(WidthConfig):
     """How often the policy is evaluated while it learns."""
 
     every: int = option("iterations from one exact evaluation to the next", unit="iterations", ge=1)
@@ -90,6 +90,7 @@ class TrainConfig(WorldConfig):
     task: TaskConfig
     algo: AlgoConfig
     collector: CollectorConfig
+    targets: MergedTargetsConfig
     partition: PartitionConfig
     log: dict[str, LogConfig]
     evaluation: EvaluationConfig
@@ -106,6 +107,15 @@ class TrainConfig(WorldConfig):
         expects="the folder of a run",
         path=True,
     )
+
+    def check(self, key: str, root: Any) -> None:
+        """Blocks and logged episodes are of a single target."""
+        if self.targets.count > 1 and self.algo.joint:
+            several = f"with targets.count={self.targets.count} and algo={self.algo.name}"
+            if self.partition.block is not None:
+                raise refuse("partition.block", self.partition.block, f"null {several}")
+            if "mcap" in self.log:
+                raise refuse("log", listed(self.log), f"one without mcap {several}")
 
 
 class EvaluateConfig(WorldConfig):

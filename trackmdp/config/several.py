@@ -51,8 +51,12 @@ class MergedTargetsConfig(TargetsConfig):
     )
 
     def ignored(self, root: Any) -> dict[str, str]:
-        """One target needs no merging."""
-        return {"merge": "with targets.count=1"} if self.count == 1 else {}
+        """One target needs no merging, and no more does a policy that was learned for all."""
+        algo: Any = getattr(root, "algo", None)
+        if algo is not None and algo.joint:
+            return {"merge": f"with algo={algo.name}, which learns of all targets together"}
+        unknown = getattr(root, "run", None) is not None  # a run has a number of its own
+        return {} if self.count > 1 or unknown else {"merge": "with targets.count=1"}
 
 
 class WidthConfig(NodeConfig):
@@ -66,4 +70,5 @@ class WidthConfig(NodeConfig):
 
     def ignored(self, root: Any) -> dict[str, str]:
         """Figures of one target are exact."""
-        return {"width": "with targets.count=1"} if root.targets.count == 1 else {}
+        known = getattr(root, "run", None) is None
+        return {"width": "with targets.count=1"} if known and root.targets.count == 1 else {}

@@ -73,7 +73,7 @@ class _Batch:
             torch.randint(cells, shape[1:], generator=rng).numpy() for rng in self._moves.generators
         ]
         place: IndexArray = np.stack(starts) + self._group.kind * cells
-        clocks = Clocks(place, np.zeros(shape, np.int64), np.ones(shape, dtype=bool))
+        clocks = self._rule.start(place)
         beliefs, step = Beliefs.at(np.arange(place.size), place.ravel()), 0
         while len(row := np.flatnonzero(clocks.present.any(axis=1))):
             place, clocks, beliefs = self._step(row, step, place, clocks, beliefs)

@@ -5,7 +5,7 @@ A rule is the common form: it maps states to sets of sensors.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from inspect import signature
 from typing import Any, TypeAlias
 
@@ -62,9 +62,13 @@ def acting() -> set_exploration_type:
     return set_exploration_type(exploration_type() or ExplorationType.RANDOM)
 
 
-def state_keys(task: Task) -> list[str]:
-    """Observed keys of a state; `key` is one where a policy remembers more than the cell."""
-    return [*STATE_KEYS, "key"] if task.keyed else list(STATE_KEYS)
+def state_keys(task: Task, targets: Sequence[int] = ()) -> list[str]:
+    """Observed keys of a state; with `key` where a policy remembers more than the cell.
+
+    With `present` where there are several targets, of the kinds `targets`.
+    """
+    more = ["key"] if task.keyed else ["present"] if targets else []
+    return [*STATE_KEYS, *more]
 
 
 def known_task(task: Task, policy: object) -> Task:

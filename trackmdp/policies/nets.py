@@ -21,6 +21,7 @@ from torchrl.modules import ProbabilisticActor, ValueOperator
 
 from trackmdp.policies.few_sensors import FewSensors, greedy
 from trackmdp.policies.forms import state_keys
+from trackmdp.policies.joint_nets import OverTargets, last_clock
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
@@ -82,13 +83,29 @@ class StateEncoder(nn.Module):
 class StateNetwork(nn.Module):
     """A `StateEncoder` with a linear head on top."""
 
-    def __init__(self, task: Task, hidden: int, head: nn.Linear) -> None:
+    def __init__(
+        self, task: Task, hidden: int, head: nn.Linear, targets: Sequence[int] = ()
+    ) -> None:
         super().__init__()
-        self.encoder, self.head = StateEncoder(task, hidden), head
+        self.encoder, self.head = _encoder(task, hidden, targets), head
 
     def forward(self, *state: Tensor) -> Tensor:
         """`[..., head.out_features]` of a batch of states of shape `[...]`, the arguments those of the encoder."""
         return self.head(self.encoder(*state))
+
+
+def _encoder(task: Task, hidden: int, targets: Sequence[int], **scales: float) -> nn.Module:
+    """A `StateEncoder`, of several targets one for each kind, added up."""
+    if not targets:
+        return StateEncoder(task, hidden, **scales)
+    return OverTargets((StateEncoder(task, hidden, **scales) for _ in set(targets)), targets)
+
+
+def _shared(task: Task, targets: Sequence[int]) -> nn.Module:
+    """A `RelativeBias`, of several targets as `_encoder`."""
+    if not targets:
+        return RelativeBias(task)
+    return OverTargets((RelativeBias(task) for _ in set(targets)), targets)
 
 
 class RelativeBias(nn.Module):
@@ -181,20 +198,22 @@ class SubsetDistribution(dist.Independent):  # type: ignore[type-arg]
     deterministic_sample = mode
 
 
-def make_actor(task: Task, hidden: int, initial_logit: float) -> ProbabilisticActor:
+def make_actor(
+    task: Task, hidden: int, initial_logit: float, targets: Sequence[int] = ()
+) -> ProbabilisticActor:
     """State -> `logits` `[B, K]` -> `action` `[B, K]` bool, with `action_log_prob` `[B]`.
 
     K = M, or with `grid.window` the sensors around `last_cell`; those outside the grid are never on. With a budget no
-    more are on than it allows.
+    more are on than it allows. `targets` are the kinds of several targets (`OverTargets`).
     """
     head = nn.Linear(hidden, task.num_sensors)
     nn.init.orthogonal_(head.weight, gain=0.01)
     nn.init.constant_(head.bias, initial_logit)
     window = None if task.numbered is None else Window.of(task)
-    network = _Logits(StateNetwork(task, hidden, head), RelativeBias(task), window)
+    network = _Logits(StateNetwork(task, hidden, head, targets), _shared(task, targets), window)
     few = task.budget is not None and task.budget < task.num_sensors
     return ProbabilisticActor(
-        TensorDictModule(network, in_keys=state_keys(task), out_keys=["logits"]),
+        TensorDictModule(network, in_keys=state_keys(task, targets), out_keys=["logits"]),
         in_keys=["logits"],
         distribution_class=FewSensors if few else SubsetDistribution,
         distribution_kwargs={"budget": task.budget} if few else {},
@@ -205,7 +224,7 @@ def make_actor(task: Task, hidden: int, initial_logit: float) -> ProbabilisticAc
 class _Logits(nn.Module):
     """A network's logits on top of the logits that all cells share."""
 
-    def __init__(self, network: StateNetwork, shared: RelativeBias, window: Window | None) -> None:
+    def __init__(self, network: StateNetwork, shared: nn.Module, window: Window | None) -> None:
         super().__init__()
         self.network, self.shared, self.window = network, shared, window
 
@@ -220,12 +239,13 @@ class _Logits(nn.Module):
         return logits.masked_fill(~inside, _NEVER)
 
 
-def make_critic(task: Task, hidden: int) -> ValueOperator:
-    """State -> `state_value` `[B, 1]`."""
+def make_critic(task: Task, hidden: int, targets: Sequence[int] = ()) -> ValueOperator:
+    """State -> `state_value` `[B, 1]`; `targets` as of `make_actor`."""
     head = nn.Linear(hidden, 1)
     nn.init.orthogonal_(head.weight)
     nn.init.zeros_(head.bias)
-    return ValueOperator(StateNetwork(task, hidden, head), in_keys=state_keys(task))
+    network = StateNetwork(task, hidden, head, targets)
+    return ValueOperator(network, in_keys=state_keys(task, targets))
 
 
 _ALL_ON = (
@@ -241,12 +261,12 @@ class AdditiveQ(nn.Module):
     q_j counts in units of the sensor's price.
     """
 
-    def __init__(self, task: Task, hidden: int, scale: float) -> None:
+    def __init__(self, task: Task, hidden: int, scale: float, targets: Sequence[int] = ()) -> None:
         super().__init__()
-        self.t_max = task.t_max
-        self.encoder = StateEncoder(task, hidden, scale=1.0, history_scale=0.03)
+        self.t_max, self.targets = task.t_max, targets
+        self.encoder = _encoder(task, hidden, targets, scale=1.0, history_scale=0.03)
         self.base, self.sensor = nn.Linear(hidden, 1), nn.Linear(hidden, task.num_sensors)
-        self.shared = RelativeBias(task)
+        self.shared = _shared(task, targets)
         for head, start in ((self.base, 0.0), (self.sensor, _ALL_ON)):
             nn.init.orthogonal_(head.weight, gain=0.01)
             nn.init.constant_(head.bias, start)
@@ -261,7 +281,7 @@ class AdditiveQ(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """V `[..., 1]` and q `[..., K]`, the latter 0 where the safe action is forced and outside the grid."""
         features = self.encoder(last_cell, steps_since_detection, action_history, *key)
-        free = (steps_since_detection <= self.t_max).unsqueeze(-1)
+        free = (last_clock(steps_since_detection, self.targets) <= self.t_max).unsqueeze(-1)
         unit = self.units(last_cell)
         worth = self.sensor(features) + self.shared(last_cell, steps_since_detection, *key)
         return self.base(features), unit * worth * free
@@ -323,11 +343,13 @@ class EpsilonFlip(TensorDictModuleBase):
         return tensordict.set("action", chosen)
 
 
-def make_qvalue(task: Task, hidden: int, scale: float) -> TensorDictModule:
-    """State -> `base` `[B, 1]`, `sensor_value` `[B, K]`, for rewards multiplied by `scale`."""
-    return TensorDictModule(
-        AdditiveQ(task, hidden, scale), in_keys=state_keys(task), out_keys=["base", "sensor_value"]
-    )
+def make_qvalue(
+    task: Task, hidden: int, scale: float, targets: Sequence[int] = ()
+) -> TensorDictModule:
+    """State -> `base` `[B, 1]`, `sensor_value` `[B, K]`, for rewards multiplied by `scale`; see `make_actor`."""
+    network = AdditiveQ(task, hidden, scale, targets)
+    keys = state_keys(task, targets)
+    return TensorDictModule(network, in_keys=keys, out_keys=["base", "sensor_value"])
 
 
 class CellClockNet(nn.Module):

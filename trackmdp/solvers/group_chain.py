@@ -46,9 +46,12 @@ class Chain:
 
 
 def joint_chain(rule: Rule, most: int = MOST_STATES) -> Array | None:
-    """`[1, 6]` exact expected totals of a policy from a uniform start; None where there are more joint states."""
+    """`[1, 6]` exact expected totals of a policy from a uniform start.
+
+    None where there are more joint states, or the policy remembers more than beliefs.
+    """
     group = rule.group
-    if group.task.num_cells ** len(group) > most:
+    if group.task.num_cells ** len(group) > most or rule.reads_history:
         return None
 
     def choices(joint: Joint) -> list[IndexArray]:

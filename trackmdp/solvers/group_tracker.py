@@ -40,9 +40,7 @@ class GroupTracker:
                 f"cells={list(cells)}: expected {count}, each from 0 to {self._cells - 1}"
             )
         located = np.asarray(cells, dtype=np.int64) + self._group.kind * self._cells
-        shape = (1, count)
-        present = np.ones(shape, dtype=bool)
-        self._clocks = Clocks(located[None], np.zeros(shape, dtype=np.int64), present)
+        self._clocks = policy.start(located[None])
         self._beliefs = Beliefs.at(np.arange(count), located)
 
     @property
@@ -95,7 +93,8 @@ class GroupTracker:
         self._beliefs = self._left(moved, sees, present & ~seen, place, seen)
         located = np.where(seen, place + self._group.kind * self._cells, before.located[0])
         misses = np.where(seen, 0, before.misses[0] + 1)
-        self._clocks = Clocks(located[None], misses[None], present[None])
+        history = before.remembered(on)
+        self._clocks = Clocks(located[None], misses[None], present[None], history)
 
     def _left(
         self, moved: Beliefs, sees: BoolArray, missed: BoolArray, place: np.ndarray, seen: BoolArray

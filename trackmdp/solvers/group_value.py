@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy import sparse
 
 from trackmdp.seeding import derive
 from trackmdp.solvers.group_chain import joint_chain
@@ -74,9 +73,8 @@ def simulated(rule: Rule, episodes: int, seed: int, name: str) -> Array:
 def known_rewards(rule: Rule) -> list[Array]:
     """For each kind `[M]`, the reward of the first set of a single target in each cell."""
     rewards = []
-    for world, table in zip(rule.group.kinds, rule.tables, strict=True):
-        assert table.sets is not None
-        first = sparse.csr_array(table.sets[:: world.num_choices], dtype=np.float64)
+    for world, sets in zip(rule.group.kinds, rule.first_sets(), strict=True):
+        first = sets.astype(np.float64)
         seen = world.kernel.multiply(first) @ world.detection
         rewards.append(world.reward * seen - (first @ world.paid) * world.stay_probability)
     return rewards
@@ -117,15 +115,16 @@ class _Batch:
         cell = np.random.default_rng(self.moves.integers(2**63)).integers(
             self.cells, size=self.shape
         )
-        located = cell + self.group.kind * self.cells
-        return Clocks(located, np.zeros(self.shape, np.int64), np.ones(self.shape, dtype=bool))
+        return self.rule.start(cell + self.group.kind * self.cells)
 
     def totals(self) -> Array:
         """`[E, 7]`."""
         rows = np.arange(math.prod(self.shape))
         beliefs, found = Beliefs.at(rows, self.place.ravel()), np.zeros((self.shape[0], 7))
+        moved = Beliefs.at(rows[:0], rows[:0])
         while self.clocks.present.any():
-            moved = beliefs.moved(self.group)
+            if not self.rule.reads_history:
+                moved = beliefs.moved(self.group)
             found[:, 6] += (self.known[self.place] * self.clocks.present).sum(axis=1)
             on = self.rule.sets(self.clocks, moved)
             beliefs = self._step(moved, on, found)

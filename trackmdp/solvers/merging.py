@@ -22,6 +22,7 @@ from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
+from scipy import sparse
 
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
@@ -40,11 +41,21 @@ class Clocks:
         located: `[E, K]`, state of the last detection.
         misses: `[E, K]`, n.
         present: `[E, K]`, whether the target is in the grid.
+        history: `[E, t_max + 1, S]`, the sets of the last steps, the latest first, for a rule that `reads_history`.
     """
 
     located: IndexArray
     misses: IndexArray
     present: BoolArray
+    history: BoolArray | None = None
+
+    def remembered(self, on: IndexArray) -> BoolArray | None:
+        """The history after a step with the sensors `on`, sorted numbers e · S + j."""
+        if self.history is None:
+            return None
+        latest = np.zeros_like(self.history[:, :1])
+        latest.reshape(-1)[on] = True
+        return np.concatenate([latest, self.history[:, :-1]], axis=1)
 
 
 Reports: TypeAlias = tuple[BoolArray, BoolArray]
@@ -118,6 +129,8 @@ class Rule(ABC):
     """
 
     name = ""
+    reads_history = False
+    """Whether it reads the sets of the last steps, in place of beliefs."""
 
     def __init__(self, group: Group, tables: Sequence[PolicyTable]) -> None:
         self.group, self.tables = group, tuple(map(_with_sets, tables))
@@ -129,6 +142,20 @@ class Rule(ABC):
                 raise UserError(
                     "policy: expected one that remembers the cell and does not draw, for several targets"
                 )
+
+    def within(self, group: Group) -> Rule:
+        """The same policy for other targets of the same task."""
+        return self if group is self.group else type(self)(group, self.tables)
+
+    def start(self, located: IndexArray) -> Clocks:
+        """All targets of E episodes located in the states `[E, K]`."""
+        history = np.zeros((len(located), self.task.num_choices, self.cells), dtype=bool)
+        kept = history if self.reads_history else None
+        return Clocks(located, np.zeros_like(located), np.ones(located.shape, dtype=bool), kept)
+
+    def first_sets(self) -> list[sparse.csr_array]:
+        """For each kind `[M, S]`, the set of a single target that is located."""
+        return [sparse.csr_array(_sets(table)[:: self.task.num_choices]) for table in self.tables]
 
     @abstractmethod
     def sets(self, seen: Clocks, moved: Beliefs) -> IndexArray:
@@ -160,8 +187,7 @@ class Union(Rule):
             episode, target = np.nonzero(free & (self.group.kind == kind))
             cell = seen.located[episode, target] - kind * self.cells
             row = cell * self.task.num_choices + seen.misses[episode, target]
-            assert table.sets is not None
-            on = table.sets[row].tocoo()
+            on = _sets(table)[row].tocoo()
             found.append(episode[on.row] * self.cells + on.col)
         return np.unique(np.concatenate(found))
 
@@ -235,6 +261,12 @@ def _with_sets(table: PolicyTable) -> PolicyTable:
     return PolicyTable.from_dense(table.task, table.dense())
 
 
+def _sets(table: PolicyTable) -> sparse.csr_array:
+    """The sets of a table that has them written out."""
+    assert table.sets is not None
+    return table.sets
+
+
 def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str = "gains") -> Rule:
     """The policy for several targets that single ones make, merged by `gains`, or their plain `union`."""
     kinds = {"gains": Merged, "union": Union}
@@ -265,12 +297,13 @@ def followed(
     found = left.joined(Beliefs.at(again, place.ravel()[again]), group.kernel.shape[0])
     # A target that has left keeps no clock.
     misses = np.where(present & ~seen, clocks.misses + 1, 0)
-    return Clocks(np.where(seen, place, clocks.located), misses, present), found
+    located = np.where(seen, place, clocks.located)
+    return Clocks(located, misses, present, clocks.remembered(on)), found
 
 
 def switched_on(sets: IndexArray, codes: IndexArray) -> BoolArray:
     """Whether each of `codes` is among the sorted numbers `sets`."""
     if not len(sets):
-        return np.zeros(len(codes), dtype=bool)
+        return np.zeros(codes.shape, dtype=bool)
     place = np.minimum(np.searchsorted(sets, codes), len(sets) - 1)
     return np.asarray(sets[place] == codes)

@@ -130,9 +130,10 @@ def group_rule(group: Group, policy: Any, merge: str = "gains") -> Any:
     """The `merging.Rule` of a policy for several targets: itself, or the merged plans of single ones."""
     merging = import_module("trackmdp.solvers.merging")
     if isinstance(policy, merging.Rule):
-        return policy
-    tables = getattr(policy, "tables", None)
-    if tables is None:
+        return policy.within(group)
+    if (tables := getattr(policy, "tables", None)) is None:
+        if isinstance(held := getattr(policy, "policy", None), merging.Rule):
+            return held.within(group)
         tables = [_table(world, policy) for world in group.kinds]
     return merging.make_rule(group, tables, merge)
 

@@ -39,13 +39,14 @@ from trackmdp.training.lock import locked
 from trackmdp.training.run import complete, load_run
 from trackmdp.training.trainer import Trainer
 from trackmdp.untrusted import decoded
+from trackmdp.world.group import Subject, one_target
 from trackmdp.world.model import World
 from trackmdp.world.problem_file import PROBLEM, problem_bytes, problem_digest
-from trackmdp.world.tracks import Problem, modelled
+from trackmdp.world.tracks import modelled
 
 
 def make_trainer(
-    problem: Problem,
+    problem: Subject,
     config: TrainConfig,
     *,
     folder: Path | None = None,
@@ -89,7 +90,7 @@ class BlockTrainer(Learning):
         Raises:
             UserError, Preempted, RunError: as `Trainer.run` of a block.
         """
-        world = modelled(self.problem, "partition.block")
+        world = modelled(one_target(self.problem, "partition.block"), "partition.block")
         cfg, began = self.config.partition, time.monotonic()
         halo, side = default_halo(world) if cfg.halo is None else cfg.halo, cfg.block
         assert side is not None
@@ -122,7 +123,7 @@ class BlockTrainer(Learning):
         return score
 
 
-def _resumed(config: TrainConfig, problem: Problem, folder: Path) -> bool:
+def _resumed(config: TrainConfig, problem: Subject, folder: Path) -> bool:
     """Whether the folder holds this run already.
 
     Raises:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # the display of a planner is no reason to load torch
     from trackmdp.config import TrainConfig
     from trackmdp.policies.policy import Policy
     from trackmdp.training.evaluator import Evaluator, Score
-    from trackmdp.world.tracks import Problem
+    from trackmdp.world.group import Subject
 
 Row = Mapping[str, float | int | None]
 """Figures of one iteration by their names, as `metrics.csv` has them; None for missing figures."""
@@ -38,7 +38,7 @@ class Learning:
     """A run that learns, of the whole grid or by blocks.
 
     Args:
-        problem: the world, or recorded tracks. A learner is given its task alone.
+        problem: the world, recorded tracks, or several targets. A learner is given its task alone.
         config: the checked config of `trackmdp train`.
         folder: of the run's files; None to write nothing.
         console: where progress is shown; None for nowhere.
@@ -53,7 +53,7 @@ class Learning:
     evaluator: Evaluator
 
     def __init__(
-        self, problem: Problem, config: TrainConfig, folder: Path | None, console: Console | None
+        self, problem: Subject, config: TrainConfig, folder: Path | None, console: Console | None
     ) -> None:
         self.problem, self.config, self.folder = problem, config, folder
         self.console = console or Console(quiet=True)

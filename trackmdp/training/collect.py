@@ -19,12 +19,12 @@ from trackmdp.seeding import derive
 from trackmdp.solvers.workers import end_with_parent
 from trackmdp.training.devices import make_device
 from trackmdp.world.env import TrackEnv
-from trackmdp.world.tracks import Problem
+from trackmdp.world.group import Subject
 
 
 def make_collector(
     cfg: TrainConfig,
-    problem: Problem,
+    problem: Subject,
     policy: TensorDictModuleBase,
     device: torch.device,
     *,
@@ -37,7 +37,7 @@ def make_collector(
 
 
 def single(
-    problem: Problem,
+    problem: Subject,
     policy: TensorDictModuleBase,
     cfg: CollectorConfig,
     *,
@@ -64,7 +64,7 @@ def single(
 
 def _in_workers(
     kind: Callable[..., BaseCollector],
-    problem: Problem,
+    problem: Subject,
     policy: TensorDictModuleBase,
     cfg: WorkersConfig,
     *,
@@ -90,7 +90,7 @@ multi_async = partial(_in_workers, MultiAsyncCollector)
 
 
 def ray(
-    problem: Problem,
+    problem: Subject,
     policy: TensorDictModuleBase,
     cfg: RayWorkersConfig,
     *,
@@ -139,7 +139,7 @@ def _common(cfg: CollectorConfig, device: torch.device, done: int) -> dict[str, 
     }
 
 
-def _worker_env(world: Problem, worker: str, env: dict[str, Any]) -> TrackEnv:
+def _worker_env(world: Subject, worker: str, env: dict[str, Any]) -> TrackEnv:
     """Built in a worker process: its own stream for the targets, and for the actions sampled there."""
     # Ctrl-C, and a scheduler's SIGTERM, go to the workers as well. They must not die of them: the learner would wait
     # for an answer of theirs while it should save. It requests their end, and kills the others.
@@ -150,7 +150,7 @@ def _worker_env(world: Problem, worker: str, env: dict[str, Any]) -> TrackEnv:
     return TrackEnv(world, stream=f"world-{worker}", **env)
 
 
-def _remote_env(world: Problem, worker: str, env: dict[str, Any], threads: int) -> TrackEnv:
+def _remote_env(world: Subject, worker: str, env: dict[str, Any], threads: int) -> TrackEnv:
     torch.set_num_threads(threads)
     torch.manual_seed(derive(env["seed"], "torch", worker))
     return TrackEnv(world, stream=f"world-{worker}", **env)

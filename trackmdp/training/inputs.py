@@ -14,32 +14,34 @@ from trackmdp.config.learning import file_of_classes
 from trackmdp.config.resume import fixed_options
 from trackmdp.config.tree import config_text
 from trackmdp.durable import write_bytes, write_text
+from trackmdp.world.group import Subject, learned_in
 from trackmdp.world.make import make_problem
 from trackmdp.world.model import Array
 from trackmdp.world.problem_file import PROBLEM, problem_bytes, problem_digest, read_problem
-from trackmdp.world.tracks import Problem
 
 
-def write_inputs(config: TrainConfig, problem: Problem, folder: Path, *, resumed: bool) -> None:
+def write_inputs(config: TrainConfig, problem: Subject, folder: Path, *, resumed: bool) -> None:
     """Write the problem, with the classes of cells that a file gives the learner, and the config.
 
     A resumed run keeps its `problem.npz`: `identity` has shown that it is the same.
     """
     if not resumed:
-        classes = cell_classes(file_of_classes(config.algo), problem.size)
+        classes = cell_classes(file_of_classes(config.algo), problem.task.size)
         write_bytes(folder / PROBLEM, problem_bytes(problem, classes))
     # The config last: with it the folder is a run's, and all that belongs to it must be there.
     write_text(folder / "config.yaml", config_text(config, folder))
 
 
-def problem_of(config: TrainConfig, folder: Path) -> Problem:
+def problem_of(config: TrainConfig, folder: Path) -> Subject:
     """The problem of the run in `folder`; before it has begun, the one that its config describes.
 
     Raises:
         UserError: a file is missing, damaged or malformed.
     """
     begun = (folder / "config.yaml").is_file()
-    return read_problem(folder / PROBLEM) if begun else make_problem(config)
+    if begun:
+        return read_problem(folder / PROBLEM)
+    return learned_in(make_problem(config), config.targets.count, joint=config.algo.joint)
 
 
 def with_own_classes(config: TrainConfig, folder: Path) -> TrainConfig:
@@ -56,7 +58,7 @@ def as_word(values: Array, folder: Path) -> float | str:
     return float(values[0]) if same else str(folder.absolute() / PROBLEM)
 
 
-def identity(config: TrainConfig, folder: Path, problem: Problem) -> str:
+def identity(config: TrainConfig, folder: Path, problem: Subject) -> str:
     """SHA-256 of the problem and of all options that must not change when the run in `folder` is resumed."""
     # repr writes floats with all digits, so that equal hashes mean equal options.
     options = repr(fixed_options(own_paths(config, folder)))
@@ -64,6 +66,6 @@ def identity(config: TrainConfig, folder: Path, problem: Problem) -> str:
 
 
 @lru_cache(maxsize=1)
-def _digest(problem: Problem) -> str:
+def _digest(problem: Subject) -> str:
     """`problem_digest`, kept: a large problem takes a second, and each checkpoint asks for it."""
     return problem_digest(problem)

@@ -26,6 +26,7 @@ from trackmdp.notebook.drawing import drawn
 from trackmdp.solvers.evaluation import figures
 from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.untrusted import decoded, opened
+from trackmdp.world.group import Group
 
 
 def make_loggers(cfg: TrainConfig, folder: Path) -> list[Callback]:
@@ -168,6 +169,8 @@ def pictures_of(trainer: Training) -> dict[str, Any]:
     from trackmdp.notebook.pictures import Heat, picture_of
 
     policy, problem = trainer.policy(), trainer.problem
+    if isinstance(problem, Group):
+        return {}
     found = {"policy": picture_of(policy), "world": picture_of(problem)}
     value = trainer.score.evaluation.value
     if value.shape == (problem.num_cells,) and np.isfinite(value).any():

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from trackmdp.config import TrainConfig
-from trackmdp.world.model import Task
+from trackmdp.world.group import Subject
 from trackmdp.world.tracks import Recorded
 
 FAR = 0.05
 """Regret per step, in rewards of a detection, from which a policy counts as poor."""
 
 
-def why_chosen(config: TrainConfig, task: Task) -> str | None:
+def why_chosen(config: TrainConfig, subject: Subject) -> str | None:
     """The estimate that `model_based`, the default, makes of this problem, and the reason; None of other learners."""
     if config.algo.name != "model_based":
         return None
-    recorded = isinstance(task, Recorded)
+    recorded, task = isinstance(subject, Recorded), subject.task
     estimate = getattr(config.algo, "estimate", None) or ("moves" if task.markov else "paths")
     if not task.markov:
         cause = "recorded tracks" if recorded else "hidden modes"

@@ -21,20 +21,23 @@ from trackmdp.config import load_run_config
 from trackmdp.config.tree import config_digest
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import NONE, Card, Carded, decimal, grid_words
-from trackmdp.policies.policy import Policy, actor_table
+from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import load_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluation import Evaluation, figures
 from trackmdp.solvers.solution import Solution
+from trackmdp.solvers.value import group_rule
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Learning, Row, Training
 from trackmdp.training.devices import machine
 from trackmdp.training.evaluator import Evaluator, Score, while_collecting
 from trackmdp.training.folders import SUMMARY, check_files, read_summary, write_summary
+from trackmdp.training.group_run import Several, beside, learned_policy
 from trackmdp.training.inputs import problem_of, with_own_classes
 from trackmdp.training.state import load_learned
 from trackmdp.untrusted import LARGE, decoded, read_text
+from trackmdp.world.group import Subject, group_of, one_target
 from trackmdp.world.model import Array
 from trackmdp.world.tracks import Problem
 
@@ -54,6 +57,8 @@ class Run(Carded):
         summary: the content of `summary.json`.
         folder: where its files are; None where none were written.
         solution: the optimum, or a bracket of it, where it was solved for at the end.
+        several: the policy for several targets beside the bracket, where there are several; None in a run that was
+            loaded, whose `summary` has the figures.
     """
 
     policy: Policy
@@ -62,6 +67,7 @@ class Run(Carded):
     summary: dict[str, Any]
     folder: Path | None = None
     solution: Solution | None = None
+    several: Several | None = None
 
     @property
     def metrics(self) -> Any:
@@ -118,11 +124,13 @@ def complete(trainer: Learning) -> Run:
     score = trainer.run()
     policy = trainer.policy()
     solution = _solve(trainer, policy)
+    several = _several(trainer, policy, solution)
+    if several is not None and trainer.problem.targets:
+        score = several.score
     # Exact figures were scored already; on recorded tracks the held-out ones are looked at here for the first
     # time.
-    final = (
-        trainer.evaluator.evaluate(policy) if trainer.problem.model is None else score.evaluation
-    )
+    recorded = trainer.problem.model is None and not trainer.problem.targets
+    final = trainer.evaluator.evaluate(policy) if recorded else score.evaluation
     if solution is not None:
         score = trainer.evaluator.tighten(
             solution.lower, solution.upper, score
@@ -132,13 +140,15 @@ def complete(trainer: Learning) -> Run:
         "cpu_seconds": time.process_time() - used,
     }
     summary = summarize(trainer, final, score, solution, times)
+    summary["several"] = None if several is None else several.report()
     if trainer.folder is not None:
         policy.save(trainer.folder / "policy.npz", final.value)
         # Last, for a folder with a summary is a finished run.
         write_summary(trainer.folder, summary)
     # A resumed run's earlier rows are in its file alone.
     metrics = rows.columns if trainer.folder is None else read_metrics(trainer.folder)
-    return Run(policy, final, metrics or rows.columns, summary, trainer.folder, solution)
+    columns = metrics or rows.columns
+    return Run(policy, final, columns, summary, trainer.folder, solution, several)
 
 
 def _solve(trainer: Learning, learned: Policy) -> Solution | None:
@@ -154,6 +164,17 @@ def _solve(trainer: Learning, learned: Policy) -> Solution | None:
         return optimal.solve(world, nodes=cfg.nodes, time_limit=cfg.time_limit, start=start)
 
 
+def _several(trainer: Learning, policy: Policy, single: Solution | None) -> Several | None:
+    """The policy for all targets beside the bracket, where there are several."""
+    cfg = trainer.config
+    if cfg.targets.count == 1:
+        return None
+    group = group_of(trainer.problem, cfg.targets.count)
+    rule = group_rule(group, policy, *([] if cfg.algo.joint else [cfg.targets.merge]))
+    with trainer.console.status("simulating all targets"):
+        return beside(rule, cfg.optimal, width=cfg.evaluation.width, seed=cfg.seed, single=single)
+
+
 def load_run(folder: str | Path) -> Run:
     """A finished run from its folder.
 
@@ -165,9 +186,14 @@ def load_run(folder: str | Path) -> Run:
         raise UserError(f"run={folder}: not the folder of a finished run (it has no {SUMMARY})")
     summary = read_summary(place)
     check_files(place, summary)
-    table, value = load_policy(place / "policy.npz")
+    config = load_run_config(place)
+    if config.targets.count > 1 and config.algo.joint:
+        policy, value = trained(str(folder), torch.device("cpu"))[1], None
+    else:
+        table, value = load_policy(place / "policy.npz")
+        policy = Policy.from_table(table)
     return Run(
-        Policy.from_table(table),
+        policy,
         _evaluation(place, summary, value),
         read_metrics(place),
         summary,
@@ -252,7 +278,7 @@ def summarize(
         "regret_per_step_lower": score.regret_per_step_lower,
         "while_collecting": while_collecting(evaluator.upper, final, end.reward, end.frames),
         "held_out": evaluator.report(trainer.policy()),
-        "place": trainer.problem.place.facts() if trainer.problem.place else None,
+        "place": place.facts() if (place := trainer.problem.task.place) else None,
         "versions": {"trackmdp": __version__, "python": platform.python_version()}
         | {name: version(name) for name in _PACKAGES},
         "machine": machine()
@@ -274,7 +300,7 @@ def references(evaluator: Evaluator, solution: Solution | None) -> dict[str, Any
     return {name: figures(each) for name, each in found.items()}
 
 
-def trained(run: str, device: torch.device, *, best: bool = False) -> tuple[Problem, Policy, str]:
+def trained(run: str, device: torch.device, *, best: bool = False) -> tuple[Subject, Any, str]:
     """Where a run learned, the policy of its newest checkpoint, or of the best one, and its name.
 
     A run by blocks has no checkpoint: the policy is the one in `policy.npz`.
@@ -290,8 +316,21 @@ def trained(run: str, device: torch.device, *, best: bool = False) -> tuple[Prob
                 f"checkpoint=best: expected newest for run={run}, whose blocks have checkpoints of their own"
             )
         return world, load_run(folder).policy, f"{cfg.algo.name}, by blocks"
-    algorithm = make_algorithm(with_own_classes(cfg, folder), world.task, device)
+    own = with_own_classes(cfg, folder)
+    algorithm = make_algorithm(own, world.task, device, targets=world.targets)
     file = folder / "checkpoints" / checkpoint.BEST if best else checkpoint.newest(folder)
     load_learned(algorithm, cfg, world, file, device)
-    policy = actor_table(world.task, algorithm.actor, device=device)
+    policy = learned_policy(world, algorithm.actor, device)
     return world, policy, f"{cfg.algo.name}, {file.name}"
+
+
+def trained_alone(
+    run: str, device: torch.device, *, best: bool = False
+) -> tuple[Problem, Policy, str]:
+    """As `trained`, of a run that learned of a single target.
+
+    Raises:
+        UserError: it did not.
+    """
+    subject, policy, name = trained(run, device, best=best)
+    return one_target(subject, f"run={run}"), policy, name

@@ -22,7 +22,7 @@ from trackmdp.training.callbacks import Callback, Position, Row, Training
 from trackmdp.training.evaluator import Score
 from trackmdp.training.inputs import identity
 from trackmdp.untrusted import decoded
-from trackmdp.world.tracks import Problem
+from trackmdp.world.group import Subject
 
 _EXACT = ("torch", "torchrl", "tensordict", "numpy", "scipy", "hydra-core", "trackmdp")
 _NOT_WEIGHTS = {"optimizer", "buffer", "generator"}
@@ -67,7 +67,7 @@ def restore(state: Mapping[str, Any], algorithm: Algorithm, collector: BaseColle
 
 
 def find(
-    cfg: TrainConfig, problem: Problem, folder: Path, device: torch.device
+    cfg: TrainConfig, problem: Subject, folder: Path, device: torch.device
 ) -> tuple[dict[str, Any] | None, list[str]]:
     """The state to resume from, None to start anew; and a line for each checkpoint that had to be passed over.
 
@@ -127,7 +127,7 @@ def take_weights(algorithm: Algorithm, run: Path, device: torch.device) -> list[
 
 
 def load_learned(
-    algorithm: Algorithm, cfg: TrainConfig, problem: Problem, file: Path, device: torch.device
+    algorithm: Algorithm, cfg: TrainConfig, problem: Subject, file: Path, device: torch.device
 ) -> None:
     """Put the learner of a checkpoint of the run `cfg` back, to use its policy.
 
@@ -141,14 +141,14 @@ def load_learned(
 
 
 def _check_identity(
-    state: Mapping[str, Any], cfg: TrainConfig, problem: Problem, file: Path
+    state: Mapping[str, Any], cfg: TrainConfig, problem: Subject, file: Path
 ) -> None:
     folder = file.parent.parent  # RUN/checkpoints/iteration-00000012.pt
     if state.get("identity") != identity(cfg, folder, problem):
         raise UserError(f"{file}: belongs to a run with another config or problem")
 
 
-def _check(state: Mapping[str, Any], cfg: TrainConfig, problem: Problem, file: Path) -> None:
+def _check(state: Mapping[str, Any], cfg: TrainConfig, problem: Subject, file: Path) -> None:
     """See that the state is one to resume from, before anything of it is used."""
     _check_identity(state, cfg, problem, file)
     with decoded(str(file), "the state of a run"):

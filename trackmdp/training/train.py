@@ -26,14 +26,15 @@ from trackmdp.training.inputs import as_word
 from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
 from trackmdp.untrusted import reason
+from trackmdp.world.group import Group, Subject, learned_in
 from trackmdp.world.make import OF_TASK
 from trackmdp.world.observation import ObservationVector
 from trackmdp.world.problem_file import problem_digest
-from trackmdp.world.tracks import Problem, check_problem
+from trackmdp.world.tracks import check_problem
 
 
 def train(
-    problem: Problem,
+    problem: Subject,
     algo: str = default("algo"),
     *,
     seed: int = 0,
@@ -51,7 +52,8 @@ def train(
         run = train(world, "ppo", total_frames=100_000, learning_rate={"end": 1e-4}, **{"collector.envs": 64})
 
     Args:
-        problem: the world, or recorded tracks; the learner is given its task alone.
+        problem: the world, or recorded tracks, or a `Group` of targets; the learner is given the task alone. Of a group
+            `a2c`, `ppo` and `dqn` learn from all targets together, the others a single target's plan, to be merged.
         algo: name of the algorithm, as in `trackmdp train algo=...`; by default `model_based`: its estimate follows
             the problem.
         seed: every random draw of the run derives from it; torch's global generators are left as they were.
@@ -70,7 +72,8 @@ def train(
         RunError: learning or writing broke down.
         Preempted: a signal ended the run; with a folder it can be resumed.
     """
-    check_problem(problem, "train")
+    if not isinstance(problem, Group):
+        check_problem(problem, "train")
     for each in callbacks:
         if not isinstance(each, Callback):
             raise UserError(f"callbacks: a {type(each).__name__}, expected a Callback")
@@ -80,28 +83,48 @@ def train(
     nets = _nets(problem, {"actor": actor, "critic": critic}, place)
     typed = {_key(name): value for name, value in options.items()}
     typed |= given({"algo": algo}) | {"seed": seed, "quiet": not progress}
-    config: TrainConfig = compose("train", typed | _words(problem, place))
+    config, subject = _config(problem, typed, place)
     if place is not None:
-        require_packages(config.log)
-        try:
-            place.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UserError(f"folder={folder}: cannot be made ({reason(error)})") from None
-        if config.resume is None and (place / "config.yaml").is_file():
-            raise UserError(
-                f"folder={folder}: holds a run already; resume it by resume='auto', or choose another one"
-            )
+        _prepare(config, place)
     with locked(place, "folder") if place else nullcontext(), preserved_global_rng():
         console = make_console(quiet=not progress)
         return complete(
             make_trainer(
-                problem, config, folder=place, callbacks=callbacks, console=console, nets=nets
+                subject, config, folder=place, callbacks=callbacks, console=console, nets=nets
             )
         )
 
 
+def _prepare(config: TrainConfig, folder: Path) -> None:
+    """Make the folder of a run.
+
+    Raises:
+        UserError: it cannot be made, or holds a run that is not to be resumed; or a log's package is missing.
+    """
+    require_packages(config.log)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"folder={folder}: cannot be made ({reason(error)})") from None
+    if config.resume is None and (folder / "config.yaml").is_file():
+        raise UserError(
+            f"folder={folder}: holds a run already; resume it by resume='auto', or choose another one"
+        )
+
+
+def _config(
+    problem: Subject, typed: dict[str, Any], folder: Path | None
+) -> tuple[TrainConfig, Subject]:
+    """The checked config, and what the learner learns in: of several targets all, or a single one."""
+    config: TrainConfig = compose("train", typed | _words(problem, folder))
+    subject = learned_in(problem, config.targets.count, joint=config.algo.joint)
+    if subject is not problem:  # the words name the problem that is in the run's folder
+        config = compose("train", typed | _words(problem, folder, subject))
+    return config, subject
+
+
 def _nets(
-    problem: Problem, given: Mapping[str, TensorDictModuleBase | None], folder: Path | None
+    problem: Subject, given: Mapping[str, TensorDictModuleBase | None], folder: Path | None
 ) -> dict[str, TensorDictModuleBase]:
     """The networks that are given, behind an `ObservationVector` where they read one.
 
@@ -110,6 +133,8 @@ def _nets(
     """
     found = {name: net for name, net in given.items() if net is not None}
     for name, net in found.items():
+        if isinstance(problem, Group):
+            raise UserError(f"{name}: expected none with several targets")
         wanted = {"actor": "action_log_prob", "critic": "state_value"}[name]
         if wanted not in getattr(net, "out_keys", ()):
             raise UserError(
@@ -131,9 +156,16 @@ def _key(name: str) -> str:
     return name if known else f"algo.{name}"
 
 
-def _words(problem: Problem, folder: Path | None) -> dict[str, Any]:
-    """The options that a problem made in Python has words for; its arrays are in the run's `problem.npz`."""
-    words: dict[str, Any] = {}
+def _words(given: Subject, folder: Path | None, subject: Subject | None = None) -> dict[str, Any]:
+    """The options that a problem made in Python has words for; its arrays are in the run's `problem.npz`.
+
+    Args:
+        given: the problem.
+        folder: of the run.
+        subject: what is in that file, where it is not `given`.
+    """
+    words: dict[str, Any] = {"targets.count": len(given)} if isinstance(given, Group) else {}
+    problem = given.kinds[0] if isinstance(given, Group) else given
     for name, option in OF_TASK.items():
         value = getattr(problem, name)
         array = isinstance(value, np.ndarray)
@@ -148,5 +180,5 @@ def _words(problem: Problem, folder: Path | None) -> dict[str, Any]:
         "kernel.motion": problem.model is not None,
         "kernel.modes": getattr(problem, "modes", 1),
         "kernel.reveals": problem.revealed > 1,
-        "kernel.digest": problem_digest(problem)[:16],
+        "kernel.digest": problem_digest(subject or given)[:16],
     }

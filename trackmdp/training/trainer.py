@@ -17,19 +17,20 @@ from trackmdp.algos.common import make_algorithm
 from trackmdp.config import TrainConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import Preempted, RunError
-from trackmdp.policies.policy import Policy, actor_table
+from trackmdp.policies.policy import Policy
 from trackmdp.seeding import seed_global
 from trackmdp.signals import Signals, Watch
 from trackmdp.training.callbacks import Callback, Position, Row, Training
 from trackmdp.training.collect import make_collector
 from trackmdp.training.devices import check_memory, make_device
 from trackmdp.training.display import Display
-from trackmdp.training.evaluator import Score, make_evaluator, while_collecting
+from trackmdp.training.evaluator import Score, while_collecting
+from trackmdp.training.group_run import evaluator_of, learned_policy
 from trackmdp.training.inputs import with_own_classes, write_inputs
 from trackmdp.training.loggers import make_loggers
 from trackmdp.training.state import Checkpoints, find, restore, take_weights
 from trackmdp.untrusted import decoded
-from trackmdp.world.tracks import Problem
+from trackmdp.world.group import Subject
 
 
 class Trainer(Training):
@@ -58,7 +59,7 @@ class Trainer(Training):
 
     def __init__(
         self,
-        problem: Problem,
+        problem: Subject,
         config: TrainConfig,
         *,
         folder: Path | None = None,
@@ -78,12 +79,12 @@ class Trainer(Training):
             # so that they must have written this iteration's row before it is saved; the display shows it afterwards.
             self.callbacks[-1:-1] = [Checkpoints(config.checkpoint, folder / "checkpoints")]
             self.callbacks[:0] = make_loggers(config, folder)
-        self.console.print(check_memory(config, problem, self.device))
+        self.console.print(check_memory(config, problem.task, self.device))
 
-    def policy(self) -> Policy:
+    def policy(self) -> Any:
         """The policy as it is now; asking for it does not disturb the run."""
         # Learners evaluate a deterministic actor, so that there is no need to ask twice whether it draws.
-        return actor_table(self.problem.task, self.algorithm.actor, device=self.device, check=False)
+        return learned_policy(self.problem, self.algorithm.actor, self.device, check=False)
 
     def run(self) -> Score:
         """Train to the end; returns the score of the last policy.
@@ -132,14 +133,14 @@ class Trainer(Training):
         # Networks are initialised from torch's global generator, so that it is seeded before anything is built.
         seed_global(config.seed)
         own = config if state is None or folder is None else with_own_classes(config, folder)
-        self.algorithm = make_algorithm(own, problem.task, self.device, self._nets)
+        self.algorithm = make_algorithm(own, problem.task, self.device, self._nets, problem.targets)
         done = Position(**state["position"]).frames if state else 0
         self.collector = make_collector(
             config, problem, self.algorithm.policy, self.device, done=done
         )
         # At once, so that worker processes end as well if a later step raises (a damaged checkpoint).
         opened.callback(self.collector.shutdown)
-        self.evaluator = make_evaluator(problem)
+        self.evaluator = evaluator_of(problem, config.seed)
         self.start = self._restore(state)
         self.position, self.collecting = self.start, 0.0
         if folder is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,7 @@ from scipy import sparse
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, grid_words
 from trackmdp.world.model import Array, Task, World
+from trackmdp.world.tracks import Problem, modelled
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -50,10 +51,19 @@ class Group(Carded):
     def __len__(self) -> int:
         return len(self.worlds)
 
-    @property
+    @cached_property
     def task(self) -> Task:
         """Grid, prices and limits, the same for all targets."""
         return self.worlds[0].task
+
+    @property
+    def targets(self) -> tuple[int, ...]:
+        """Kind of each target, as a learner is told; see `Task.targets`."""
+        return tuple(self.kind.tolist())
+
+    @property
+    def model(self) -> None:
+        """No world of one target."""
 
     @cached_property
     def kinds(self) -> tuple[World, ...]:
@@ -110,6 +120,54 @@ class Group(Carded):
         motions = "all alike" if len(self.kinds) == 1 else f"{len(self.kinds)} motions"
         facts = {"targets": f"{len(self)}, {motions}"} | task.facts()
         return Card(f"Group: {grid_words(task.size)}", facts)
+
+
+Subject: TypeAlias = Problem | Group
+"""What a learner learns in: one target, or several."""
+
+
+def one_target(subject: Subject, caller: str) -> Problem:
+    """The subject, if it is of a single target.
+
+    Raises:
+        UserError: it is a group.
+    """
+    if isinstance(subject, Group):
+        raise UserError(
+            f"{caller}: {len(subject)} targets that were learned together, expected a single one"
+        )
+    return subject
+
+
+def group_of(subject: Subject, count: int) -> Group:
+    """The targets of a subject, `count` that move alike where it is a world.
+
+    Raises:
+        UserError: it is recorded tracks, or a group of another number.
+    """
+    if isinstance(subject, Group):
+        if len(subject) != count:
+            raise UserError(f"targets.count={count}: expected {len(subject)}, as the policy has")
+        return subject
+    return Group([modelled(subject, f"targets.count={count}")] * count)
+
+
+def learned_in(subject: Subject, count: int, *, joint: bool) -> Subject:
+    """Where a learner learns a policy for `count` targets: with all of them, or with a single one.
+
+    Raises:
+        UserError: a single one, of targets that do not move alike.
+    """
+    if joint and count > 1:
+        return group_of(subject, count)
+    if not isinstance(subject, Group):
+        return subject
+    if len(subject.kinds) > 1:
+        raise UserError(
+            f"train: a Group of {len(subject.kinds)} motions, expected one with an algorithm that learns a single "
+            "target's plan; train on each world, or take a2c, ppo or dqn"
+        )
+    return subject.kinds[0]
 
 
 def _of_one_target(world: World) -> str | None:

@@ -357,6 +357,11 @@ class Task(Carded):
         return Task(**self.given)
 
     @property
+    def targets(self) -> tuple[int, ...]:
+        """Kind of each target, where there are several (`Group`)."""
+        return ()
+
+    @property
     def given(self) -> dict[str, Any]:
         """All that a `Task` holds, as arguments of its constructor and of `World`'s."""
         return {name: getattr(self, name) for name in Task.__dataclass_fields__}

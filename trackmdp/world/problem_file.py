@@ -7,12 +7,14 @@ A number or a word is an array without axes, an argument with parts has an array
     cost      (9 numbers)                    t_max   1
 
 Recorded tracks have `tracks.cells`, `tracks.first`, `tracks.exits` and `tracks.names`, and so do their other two parts.
-An argument that is None has no array: None is its default.
+An argument that is None has no array: None is its default. A group has the arrays of its first world, with the kernels
+of all kinds as blocks of one matrix, and `members`, the kind of each target.
 """
 
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -26,6 +28,7 @@ from trackmdp.errors import UserError
 from trackmdp.untrusted import LARGE, decoded, load_npz, opened
 from trackmdp.world.coverage import Coverage
 from trackmdp.world.files import csr_of, npz_bytes
+from trackmdp.world.group import Group, Subject, one_target
 from trackmdp.world.model import World
 from trackmdp.world.place import Place, place_arrays, place_in
 from trackmdp.world.tracks import Problem, Recorded, Tracks
@@ -39,23 +42,26 @@ Arrays: TypeAlias = dict[str, npt.NDArray[Any]]
 Classes: TypeAlias = npt.NDArray[np.integer[Any]]
 
 
-def problem_arrays(problem: Problem, classes: Classes | None = None) -> Arrays:
+def problem_arrays(problem: Subject, classes: Classes | None = None) -> Arrays:
     """The arrays of `problem.npz`.
 
     Args:
         problem: the world or the recorded tracks.
         classes: `[M]` class of each cell, where a learner was given them (`algo.share_cells`).
     """
-    given = {field.name: getattr(problem, field.name) for field in fields(problem)}
+    first = problem.kinds[0] if isinstance(problem, Group) else problem
+    given = {field.name: getattr(first, field.name) for field in fields(first)}
+    if isinstance(problem, Group):
+        given |= {"kernel": problem.kernel, "members": problem.kind}
     return as_arrays({"kind": type(problem).__name__, **given, "classes": classes})
 
 
-def problem_bytes(problem: Problem, classes: Classes | None = None) -> bytes:
+def problem_bytes(problem: Subject, classes: Classes | None = None) -> bytes:
     """The content of `problem.npz`; the same problem gives the same bytes. Arguments as of `problem_arrays`."""
     return npz_bytes(problem_arrays(problem, classes))
 
 
-def problem_digest(problem: Problem, classes: Classes | None = None) -> str:
+def problem_digest(problem: Subject, classes: Classes | None = None) -> str:
     """SHA-256 of all arrays of a problem, independent of their compression. Arguments as of `problem_arrays`."""
     digest = hashlib.sha256()
     for name, array in problem_arrays(problem, classes).items():
@@ -64,25 +70,44 @@ def problem_digest(problem: Problem, classes: Classes | None = None) -> str:
     return digest.hexdigest()
 
 
-def read_problem(file: Path) -> Problem:
+def read_problem(file: Path) -> Subject:
     """The problem in a `problem.npz`.
 
     Raises:
         UserError: the file is missing or damaged, or holds no problem.
     """
     with opened(file, most=LARGE) as stream, decoded(str(file), "a world or recorded tracks"):
-        return problem_in(stream)
+        return subject_in(stream)
 
 
 def problem_in(stream: BinaryIO) -> Problem:
+    """As `subject_in`, of a single target."""
+    return one_target(subject_in(stream), PROBLEM)
+
+
+def subject_in(stream: BinaryIO) -> Subject:
     """The problem in the content of a `problem.npz`; call it inside `untrusted.decoded`."""
     given = from_arrays(load_npz(stream))
     given.pop("classes", None)
-    problem: Problem = _KINDS[given.pop("kind")](**given)
+    if given["kind"] == "Group":
+        return _group(given)
+    problem = _KINDS[given.pop("kind")](**given)
     if isinstance(problem, Recorded):
         for part in (problem.tracks, problem.validation, problem.held_out):
             _check_tracks(part, problem.num_cells)
     return problem
+
+
+def _group(given: dict[str, Any]) -> Group:
+    """The group of its arguments, without `kind`."""
+    kernel, members = given.pop("kernel"), given.pop("members")
+    cells, kinds = math.prod(given["size"]), len(np.unique(members))
+    if members.ndim != 1 or kernel.shape[0] != kinds * cells or members.max() != kinds - 1:
+        raise ValueError(f"kinds {members.shape} of {kernel.shape[0]} states")
+    del given["kind"]
+    blocks = [slice(kind * cells, (kind + 1) * cells) for kind in range(kinds)]
+    worlds = [World(kernel[block][:, block], **given) for block in blocks]
+    return Group([worlds[kind] for kind in members])
 
 
 def as_arrays(given: Mapping[str, Any]) -> Arrays:
@@ -159,7 +184,7 @@ def _check_tracks(tracks: Tracks, num_cells: int) -> None:
         raise ValueError(f"a cell outside the grid of {num_cells} cells")
 
 
-def refuse_given(*_: object, **__: object) -> Problem:
+def refuse_given(*_: object, **__: object) -> Subject:
     """The maker of `kernel=given` and `sensor=given`, which describe a problem that is in a file.
 
     Raises:

@@ -13,7 +13,7 @@ from trackmdp.config import CompareConfig
 from trackmdp.durable import write_json
 from trackmdp.training.compare import Comparison, compare
 from trackmdp.training.display import make_console, table
-from trackmdp.training.run import trained
+from trackmdp.training.run import trained_alone
 from trackmdp.world.problem_file import problem_digest
 from trackmdp.world.tracks import Problem
 
@@ -24,7 +24,7 @@ def run(cfg: CompareConfig, folder: Path, problem: Problem) -> float:
     The problem is the first run's; without one, `cfg`'s.
     """
     console, policies = make_console(cfg.quiet), dict[str, Any]()
-    found = [trained(each, torch.device("cpu")) for each in cfg.runs or []]
+    found = [trained_alone(each, torch.device("cpu")) for each in cfg.runs or []]
     if found:
         problem = found[0][0]
     same = Counter(Path(each).name for each in cfg.runs or [])

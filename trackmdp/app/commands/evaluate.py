@@ -38,17 +38,17 @@ from trackmdp.solvers.evaluation import figures
 from trackmdp.solvers.group_bounds import upper_bound
 from trackmdp.solvers.group_figures import with_ends
 from trackmdp.solvers.group_value import evaluate_group
-from trackmdp.solvers.merging import make_rule
 from trackmdp.solvers.solve import baseline_policy
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.value import evaluate, group_rule
 from trackmdp.training.devices import make_device
 from trackmdp.training.display import make_console, show_held_out, table, with_interval
 from trackmdp.training.evaluator import CELL_ALONE, HeldOutEvaluator, make_evaluator
 from trackmdp.training.folders import SUMMARY, check_files, read_summary
+from trackmdp.training.group_run import FIGURES
 from trackmdp.training.run import trained
 from trackmdp.untrusted import decoded
 from trackmdp.world.gridding import said
-from trackmdp.world.group import Group
+from trackmdp.world.group import Group, Subject, group_of, one_target
 from trackmdp.world.make import false_alarm
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem, Recorded, modelled
@@ -78,13 +78,16 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem) -> float:
         and not isinstance(cfg.sensor, FalseAlarmConfig)
     ):
         return _played_back(cfg, cfg.baseline, problem, folder, console)
+    world: Subject
     if cfg.run:
         world, policy, subject = trained(cfg.run, device)
     else:
         assert cfg.baseline is not None
         world, policy, subject = problem, baseline_policy(problem, cfg.baseline), cfg.baseline.name
-    if cfg.targets.count > 1:
-        return _several(cfg, modelled(world, "evaluate"), policy, subject, folder, console)
+    count = max(cfg.targets.count, load_run_config(cfg.run).targets.count if cfg.run else 1)
+    if count > 1:
+        return _several(cfg, group_of(world, count), policy, subject, folder, console)
+    world = one_target(world, f"run={cfg.run}")
     if isinstance(cfg.sensor, FalseAlarmConfig):
         return _believing(cfg, world, policy, subject, folder, console)
     # Recorded tracks have no kernel, hence no exact value and no bound: figures come from the held-out tracks.
@@ -134,24 +137,25 @@ def _exact(
 
 
 def _several(
-    cfg: EvaluateConfig, world: World, policy: Policy, subject: str, folder: Path, at: Console
+    cfg: EvaluateConfig, group: Group, policy: Any, subject: str, folder: Path, at: Console
 ) -> float:
     """Evaluate for several targets: `evaluation.json`; returns the AIHTR."""
-    group, merge = Group([world] * cfg.targets.count), cfg.targets.merge
-    rule = make_rule(group, [policy], merge)
+    rule = group_rule(group, policy, cfg.targets.merge)
     found = evaluate_group(rule, width=cfg.evaluation.width, seed=cfg.seed)
-    names = ("aihtr", "reward_per_step", "accuracy", "sensors_per_step", "safe_per_step")
-    figures = {name: getattr(found, name) for name in names}
-    apart, upper = len(group) * evaluate(world, policy, per_cell=False).aihtr, upper_bound(group)
-    report = {"policy": subject, "targets": len(group), "merge": merge, "exact": found.exact}
+    figures, upper = {name: getattr(found, name) for name in FIGURES}, upper_bound(group)
+    apart = None
+    if rule.tables:  # else it was learned for all targets together
+        apart = len(group) * evaluate(group.kinds[0], policy, per_cell=False).aihtr
+    report = {"policy": subject, "targets": len(group), "merge": rule.name, "exact": found.exact}
     report |= {"episodes": 0 if found.exact else len(found.totals), "apart": apart, "upper": upper}
     report["expected_length"] = found.expected_length
     report["figures"] = {name: asdict(each) for name, each in figures.items()}
     write_json(folder / "evaluation.json", report)
     rows = [[name.replace("_", " "), with_ends(each)] for name, each in figures.items()]
-    rows += [["AIHTR of separate trackers", f"{apart:,.4f}"], ["upper bound", f"{upper:,.4f}"]]
+    rows += [] if apart is None else [["AIHTR of separate trackers", f"{apart:,.4f}"]]
+    rows.append(["upper bound", f"{upper:,.4f}"])
     how = "exact" if found.exact else f"{len(found.totals):,} episodes, 95 %"
-    at.print(table(f"{subject}, {len(group)} targets, {merge}", ["figure", how], rows))
+    at.print(table(f"{subject}, {len(group)} targets, {rule.name}", ["figure", how], rows))
     at.print(
         f"{(upper - found.aihtr.mean) / found.expected_length:.4f} per step below the bound; results in {folder}"
     )

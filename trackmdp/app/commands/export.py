@@ -11,7 +11,7 @@ from trackmdp.policies.export import export
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.solvers.value import evaluate
 from trackmdp.training.display import make_console
-from trackmdp.training.run import trained
+from trackmdp.training.run import trained_alone
 
 
 def run(cfg: ExportConfig, folder: Path) -> None:
@@ -20,7 +20,8 @@ def run(cfg: ExportConfig, folder: Path) -> None:
     Raises:
         UserError: there is no such run, or a package that `cfg.format` needs is missing.
     """
-    world, policy, subject = trained(cfg.run, torch.device("cpu"), best=cfg.checkpoint == "best")
+    best = cfg.checkpoint == "best"
+    world, policy, subject = trained_alone(cfg.run, torch.device("cpu"), best=best)
     if cfg.format == "sets":
         file = folder / sets_name(policy.task)
         write_sets(folder, policy)

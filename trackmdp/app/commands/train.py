@@ -14,14 +14,16 @@ from trackmdp.training.blocks import make_trainer
 from trackmdp.training.callbacks import Learning
 from trackmdp.training.display import make_console, show_held_out, table
 from trackmdp.training.folders import SUMMARY, finished
+from trackmdp.training.group_run import Several
 from trackmdp.training.inputs import problem_of
 from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
 from trackmdp.world.gridding import said
-from trackmdp.world.tracks import Problem, Recorded
+from trackmdp.world.group import Subject
+from trackmdp.world.tracks import Recorded
 
 
-def run(cfg: TrainConfig, folder: Path, problem: Problem | None = None) -> float:
+def run(cfg: TrainConfig, folder: Path, problem: Subject | None = None) -> float:
     """Train by `cfg` and write inputs, metrics, checkpoints, policy and summary to `folder`; returns the AIHTR.
 
     Args:
@@ -48,7 +50,7 @@ def run(cfg: TrainConfig, folder: Path, problem: Problem | None = None) -> float
         ) from error
 
 
-def _run(cfg: TrainConfig, folder: Path, problem: Problem | None) -> float:
+def _run(cfg: TrainConfig, folder: Path, problem: Subject | None) -> float:
     console = make_console(cfg.quiet)
     if cfg.resume is not None:
         if summary := finished(cfg, folder):
@@ -67,7 +69,9 @@ def _run(cfg: TrainConfig, folder: Path, problem: Problem | None) -> float:
             console.print(f"cost.safe: {price}; set the price of finding a lost target")
     trainer = make_trainer(problem, cfg, folder=folder, console=console)
     done = complete(trainer)
-    if done.summary["held_out"] is None:
+    if done.several is not None:
+        _show_several(console, cfg, done.several)
+    elif done.summary["held_out"] is None:
         _show_summary(console, trainer, done)
     else:
         show_held_out(console, f"learned ({cfg.algo.name})", done.summary["held_out"])
@@ -104,8 +108,19 @@ def _show_summary(console: Console, trainer: Learning, run: Run) -> None:
         console.print(f"optimum: {solution.ended}")
 
 
+def _show_several(console: Console, cfg: TrainConfig, several: Several) -> None:
+    """The policy for all targets beside the merged optimum of single ones, and the bound."""
+    found = several.figures
+    how = "exact" if found.exact else f"{len(found.totals):,} episodes, 95 %"
+    merged = "" if cfg.algo.joint else ", merged"
+    heads = ["policy", "AIHTR", "reward per step", "accuracy", "sensors per step"]
+    rows = several.rows(f"learned ({cfg.algo.name}){merged}")
+    console.print(table(f"{cfg.targets.count} targets, {how}", heads, rows))
+    console.print(several.score.regret)
+
+
 def _warn(console: Console, trainer: Learning, run: Run, others: Mapping[str, float]) -> None:
     """Print the signs of a poor policy."""
-    known, reward = run.summary["regret_per_step_lower"], trainer.problem.reward
+    known, reward = run.summary["regret_per_step_lower"], trainer.problem.task.reward
     for line in notices.poor(trainer.config, run.evaluation.aihtr, others, known, reward):
         console.print(line)

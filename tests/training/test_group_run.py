@@ -1,0 +1,167 @@
+"""Learning for several targets: together by one network, or one target's plan that is merged."""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+import trackmdp as tm
+from tests.training.runs import assert_same_run, at_iteration, train
+from trackmdp.app.cli import main
+from trackmdp.config import load_run_config
+from trackmdp.errors import Preempted, UserError
+from trackmdp.seeding import derive
+from trackmdp.solvers.group_value import evaluate_group
+from trackmdp.solvers.joint_rule import JointRule
+from trackmdp.solvers.solve import solve
+from trackmdp.solvers.value import evaluate, group_rule
+from trackmdp.training.inputs import problem_of
+from trackmdp.world.env import TrackEnv
+from trackmdp.world.group import Group
+from trackmdp.world.problem_file import problem_digest
+
+WALKS = ("targets.count=2", "kernel=random_walk", "kernel.exit_probability=0.2")
+FEW = {"total_frames": 512, "frames_per_batch": 256, "envs": 32, "hidden": 8}
+BRIEF: dict[str, Any] = {"evaluation.width": 0.2, "optimal.enabled": False}
+
+
+def group(**options: Any) -> Group:
+    given = {"size": 3, "exit_probability": 0.2, "targets": 2} | options
+    return tm.make_world("random_walk", **given)
+
+
+@pytest.mark.parametrize("algo", ["a2c", "ppo", "dqn"])
+def test_a_run_that_is_cut_goes_on_as_one_that_was_not(
+    algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = (*WALKS, "evaluation.width=0.2")
+    train(tmp_path / "whole", *words, algo=algo)
+    with monkeypatch.context() as patch, pytest.raises(Preempted):
+        at_iteration(patch, 4, lambda: signal.raise_signal(signal.SIGTERM))
+        train(tmp_path / "cut", *words, algo=algo)
+    train(tmp_path / "cut", *words, "resume=auto", algo=algo)
+    assert_same_run(tmp_path / "whole", tmp_path / "cut")
+    names = ("policy.npz", "problem.npz")
+    for name in names:
+        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "cut" / name).read_bytes()
+
+
+def test_a_loaded_run_acts_and_is_valued_as_it_was(tmp_path: Path) -> None:
+    run = tm.train(group(), "a2c", folder=tmp_path / "a", **FEW, **BRIEF)
+    loaded = tm.load_run(tmp_path / "a")
+    again = evaluate(group(), loaded, width=0.2)
+    assert again.aihtr.mean == run.evaluation.aihtr == loaded.evaluation.aihtr
+    assert run.summary["several"]["figures"]["aihtr"]["mean"] == again.aihtr.mean
+    words = ["evaluate", f"run={tmp_path / 'a'}", "evaluation.width=0.2", "quiet=true"]
+    assert main(words) == 0
+    written = json.loads((tmp_path / "a" / "evaluation.json").read_text(encoding="utf-8"))
+    assert written["figures"]["aihtr"]["mean"] == again.aihtr.mean
+    assert written["merge"] == "joint"
+
+
+def test_the_group_is_in_the_runs_folder(tmp_path: Path) -> None:
+    world = tm.make_world("random_walk", size=3, exit_probability=0.2, cost=0.1)
+    other = tm.make_world("drift", size=3, exit_probability=0.3, cost=0.1)
+    mixed = Group([other, world, other])
+    tm.train(mixed, "a2c", folder=tmp_path, **FEW, **BRIEF)
+    found = problem_of(load_run_config(tmp_path), tmp_path)
+    assert isinstance(found, Group)
+    assert found.targets == (0, 1, 0)
+    assert problem_digest(found) == problem_digest(mixed) != problem_digest(group())
+    np.testing.assert_array_equal(found.kernel.toarray(), mixed.kernel.toarray())
+
+
+def test_the_environment_pays_what_the_figures_say() -> None:
+    targets = group(budget=2, detection=0.8)
+    run = tm.train(targets, "a2c", **FEW, **BRIEF)
+    rule = group_rule(targets, run)
+    assert isinstance(rule, JointRule)
+    found = evaluate_group(rule, width=0.03)
+    env = TrackEnv(targets, 2000, seed=derive(3, "test"))
+    state, total, alive = env.reset(), np.zeros(2000), np.ones(2000, dtype=bool)
+    while alive.any():
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            state = rule.actor(state)
+        shown = env.step(state)["next"]
+        assert int(state["action"].sum(-1).max()) <= 2
+        total += shown["reward"][:, 0].numpy() * alive
+        alive &= ~shown["terminated"][:, 0].numpy()
+        state = shown.select(*env.observation_spec.keys())
+    error = total.std() / np.sqrt(len(total))
+    assert found.aihtr.high is not None
+    assert abs(total.mean() - found.aihtr.mean) < 4 * error + found.aihtr.high - found.aihtr.mean
+
+
+@pytest.mark.parametrize("merge", ["gains", "union"])
+def test_one_targets_plan_is_learned_and_merged(merge: str, tmp_path: Path) -> None:
+    words = {"total_frames": 4096, "frames_per_batch": 2048, "envs": 64}
+    run = tm.train(group(), "model_based", folder=tmp_path, **words, **{"targets.merge": merge})
+    assert run.several is not None
+    merged = evaluate(group(), run.policy, merge=merge)
+    assert merged.exact
+    assert run.summary["several"]["figures"]["aihtr"]["mean"] == merged.aihtr.mean
+    assert run.evaluation.aihtr == pytest.approx(evaluate(group().kinds[0], run.policy).aihtr)
+    best = evaluate(group(), solve(group()), merge="gains")
+    assert run.several.merged is not None
+    assert run.several.merged.aihtr.mean == best.aihtr.mean
+    assert merged.aihtr.mean <= run.summary["several"]["upper"]
+    assert main(["evaluate", f"run={tmp_path}", f"targets.merge={merge}", "quiet=true"]) == 0
+    written = json.loads((tmp_path / "evaluation.json").read_text(encoding="utf-8"))
+    assert written["figures"]["aihtr"]["mean"] == merged.aihtr.mean
+
+
+@pytest.mark.parametrize(
+    ("words", "refusal"),
+    [
+        (["algo=a2c", "log=[csv,mcap]"], "log=[csv,mcap]: expected one without mcap with targets"),
+        (["algo=a2c", "partition.block=2"], "partition.block=2: expected null with targets.count"),
+        (["algo=a2c", "targets.merge=union"], "targets.merge=union: without effect with algo=a2c"),
+        (["targets.count=1", "targets.merge=union"], "without effect with targets.count=1"),
+        (["targets.count=1", "evaluation.width=1"], "without effect with targets.count=1"),
+        (["kernel=heading"], "kernel=heading: expected a motion model without modes"),
+    ],
+)
+def test_words_without_effect_are_refused(
+    words: list[str], refusal: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    count = [] if words[0] == "targets.count=1" else ["targets.count=2"]
+    assert main(["train", *count, *words, f"hydra.run.dir={tmp_path / 'a'}"]) == 2
+    assert refusal in capsys.readouterr().err
+    assert not (tmp_path / "a").exists()
+
+
+def test_what_several_targets_cannot_do_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    world, other = group().kinds[0], tm.make_world("drift", size=3, exit_probability=0.2)
+    with pytest.raises(UserError, match="a Group of 2 motions, expected one with an algorithm"):
+        tm.train(Group([world, other]), "model_based")
+    run = tm.train(group(), "a2c", folder=tmp_path, **FEW, **BRIEF)
+    with pytest.raises(UserError, match=r"actor: expected none with several targets"):
+        tm.train(group(), "a2c", actor=run.policy.actor)
+    with pytest.raises(UserError, match=r"learned for targets of the kinds \[0, 0\], expected"):
+        evaluate(group(targets=3), run)
+    for words in (["export", "format=sets"], ["compare", "baseline=qmdp"]):
+        assert main([words[0], f"run={tmp_path}", *words[1:]]) == 2
+        assert "2 targets that were learned together, expected a single" in capsys.readouterr().err
+    assert main(["evaluate", f"run={tmp_path}", "targets.count=3"]) == 2
+    assert "targets.count=3: expected 2, as the policy has" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a2c_with_joint_credit_learns_two_targets_to_within_a_tenth_of_the_bracket() -> None:
+    targets = tm.make_world(size=4, targets=2, exit_probability=0.05)
+    run = tm.train(
+        targets, "a2c", total_frames=204_800, **{"evaluation.every": 50, "evaluation.width": 0.01}
+    )
+    assert run.several is not None
+    found = run.several.figures.reward_per_step
+    assert found.low is not None
+    assert run.several.upper / targets.expected_steps - found.low < 0.1

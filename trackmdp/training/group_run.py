@@ -1,0 +1,176 @@
+"""Policies for several targets in a training run: figures while learning, and at the end beside the bracket."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict.nn import TensorDictModuleBase
+
+from trackmdp.config.roots import OptimalBoundConfig
+from trackmdp.policies.policy import Policy, actor_table
+from trackmdp.seeding import derive
+from trackmdp.solvers import optimal
+from trackmdp.solvers.evaluation import Evaluation, regret_per_step
+from trackmdp.solvers.group_bounds import upper_bound
+from trackmdp.solvers.group_figures import GroupEvaluation, with_ends
+from trackmdp.solvers.group_solution import GroupSolution
+from trackmdp.solvers.group_value import evaluate_group
+from trackmdp.solvers.joint_rule import JointRule
+from trackmdp.solvers.merging import Rule
+from trackmdp.solvers.solution import Solution
+from trackmdp.training.evaluator import Evaluator, Score, make_evaluator
+from trackmdp.world.group import Group, Subject
+
+_SCORED = 32
+"""Episodes by which a policy is scored while it learns: with corrected means (`GroupEvaluation.aihtr`) enough to see
+it grow."""
+FIGURES = ("aihtr", "reward_per_step", "accuracy", "sensors_per_step", "safe_per_step")
+"""Figures of a policy in reports and tables."""
+
+
+class GroupEvaluator(Evaluator):
+    """Scores policies that were learned of all targets together, on the same simulated targets each time.
+
+    Args:
+        group: the targets.
+        seed: of the run; the targets are others than those of the final figures.
+    """
+
+    def __init__(self, group: Group, seed: int) -> None:
+        super().__init__(group.kinds[0])
+        self._seed = derive(seed, "scores")
+        self.upper = self.bounds["clocked"] = upper_bound(group)
+        self.lower = -math.inf
+
+    def score(self, policy: Rule) -> Score:  # type: ignore[override]  # no table
+        """Figures of `_SCORED` episodes."""
+        return self._score(means(evaluate_group(policy, seed=self._seed, episodes=_SCORED)))
+
+
+def evaluator_of(subject: Subject, seed: int) -> Evaluator:
+    """See `make_evaluator`; of several targets a `GroupEvaluator`."""
+    if isinstance(subject, Group):
+        return GroupEvaluator(subject, seed)
+    return make_evaluator(subject)
+
+
+def learned_policy(
+    subject: Subject, actor: TensorDictModuleBase, device: torch.device, *, check: bool = True
+) -> Policy | JointRule:
+    """The table of an actor, or of several targets the actor itself; see `actor_table`."""
+    if isinstance(subject, Group):
+        return JointRule(subject, actor, device)
+    return actor_table(subject.task, actor, device=device, check=check)
+
+
+def means(found: GroupEvaluation) -> Evaluation:
+    """The means alone, in the form of the figures of a single target."""
+    nothing = np.zeros(0)
+    return Evaluation(
+        aihtr=found.aihtr.mean,
+        value=nothing,
+        accuracy=found.accuracy.mean,
+        sensors_per_step=found.sensors_per_step.mean,
+        safe_per_episode=found.safe_per_step.mean * found.expected_length,
+        expected_length=found.expected_length,
+        steps=nothing,
+        detections=None,
+        sensors=None,
+        safe_actions=None,
+    )
+
+
+@dataclass(frozen=True)
+class Several:
+    """A policy for several targets beside the merged optimum of single ones, and beside the bound.
+
+    Attributes:
+        group: the targets.
+        figures: of the policy.
+        upper: proved: no policy has a higher AIHTR.
+        solution: optima of single targets; None where they were not solved for.
+        merged: figures of these, merged.
+    """
+
+    group: Group
+    figures: GroupEvaluation
+    upper: float
+    solution: GroupSolution | None
+    merged: GroupEvaluation | None
+
+    @property
+    def score(self) -> Score:
+        """The means, and their regrets."""
+        found = means(self.figures)
+        best = max(each.aihtr.mean for each in (self.figures, self.merged) if each is not None)
+        upper, lower = (regret_per_step(end, found) for end in (self.upper, best))
+        return Score(found, upper, lower)
+
+    def report(self) -> dict[str, Any]:
+        """As `summary.json` has it."""
+        found, solution = self.figures, self.solution
+        return {
+            "targets": len(self.group),
+            "exact": found.exact,
+            "episodes": 0 if found.exact else len(found.totals),
+            "expected_length": found.expected_length,
+            "figures": _intervals(found),
+            "merged_optimum": None if self.merged is None else _intervals(self.merged),
+            "apart": None if solution is None else solution.apart,
+            "lower": None if solution is None else solution.lower,
+            "upper": self.upper,
+        }
+
+    def rows(self, name: str) -> list[list[str]]:
+        """A line for each policy: name, AIHTR, reward per step, accuracy and sensors per step; and the bound."""
+        policies = {name: self.figures}
+        if self.merged is not None:
+            policies["merged optimum"] = self.merged
+        shown = ("aihtr", "reward_per_step", "accuracy", "sensors_per_step")
+        rows = [
+            [name, *(with_ends(getattr(each, figure)) for figure in shown)]
+            for name, each in policies.items()
+        ]
+        if self.solution is not None:
+            rows.append(["separate trackers", *self._plain(self.solution.apart)])
+        return [*rows, ["upper bound", *self._plain(self.upper)]]
+
+    def _plain(self, aihtr: float) -> list[str]:
+        return [f"{aihtr:,.4f}", f"{aihtr / self.figures.expected_length:.4f}", "", ""]
+
+
+def beside(
+    rule: Rule, cfg: OptimalBoundConfig, *, width: float, seed: int, single: Solution | None = None
+) -> Several:
+    """The figures of a policy, and of the optima of single targets, merged.
+
+    Args:
+        rule: the policy.
+        cfg: whether these optima are solved for, and for how long.
+        width: half of the 95 % interval of the reward per step.
+        seed: of the simulated targets.
+        single: the optimum of a single target, where it is known.
+    """
+    group = rule.group
+    figures, upper = evaluate_group(rule, width=width, seed=seed), upper_bound(group)
+    if not cfg.enabled:
+        return Several(group, figures, upper, None, None)
+    singles = (
+        tuple(
+            optimal.solve(world, nodes=cfg.nodes, time_limit=cfg.time_limit)
+            for world in group.kinds
+        )
+        if single is None
+        else (single,)
+    )
+    solution = GroupSolution(group, singles, upper, sum(each.seconds for each in singles))
+    merged = evaluate_group(solution.policy, width=width, seed=seed)
+    return Several(group, figures, upper, solution, merged)
+
+
+def _intervals(found: GroupEvaluation) -> dict[str, Any]:
+    return {name: asdict(getattr(found, name)) for name in FIGURES}
