@@ -74,6 +74,7 @@ def test_words_about_the_world_are_those_of_the_commands() -> None:
     assert (world.size, world.t_max, world.safe_cost) == ((4, 5), 2, 7)
     assert (world.cost == 0.3).all()
     assert words.as_words(words.parse(typed.split())) == typed.split()
+    assert len(words.world_of({"grid.size": "3", "targets.count": "4"})) == 4
 
 
 @pytest.mark.slow

@@ -32,8 +32,8 @@ PARTS = (
     "bracket",
     "workers",
 )
-WORLD = ("grid.", "kernel", "cost.")
-_RENAMED = {"cost.sensor": "cost", "cost.safe": "safe_cost"}
+WORLD = ("grid.", "kernel", "cost.", "targets.")
+_RENAMED = {"cost.sensor": "cost", "cost.safe": "safe_cost", "targets.count": "targets"}
 _SHARED: Row = {"threads": 1, "out": ""}
 
 

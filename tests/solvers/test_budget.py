@@ -45,7 +45,9 @@ def test_optimum_of_tiny_worlds_is_that_of_brute_force(seed: int) -> None:
     np.testing.assert_allclose(found.value, best_of_all(world), rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    "seed", [*range(4), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 100))]
+)
 def test_no_policy_with_a_budget_is_above_the_dual_over_prices(seed: int) -> None:
     world = tiny(seed, 1)
     dual = frontier(world.but(cost=0.2), near=1.0)

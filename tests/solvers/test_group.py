@@ -75,6 +75,13 @@ def test_brute_force_lies_in_the_bracket_with_both_policies_below(seed: int) -> 
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", range(5, 48))
+def test_brute_force_lies_in_the_bracket_of_many_more_worlds(seed: int) -> None:
+    world = tiny(seed)
+    check_bracket(Group([world, World.of(world, tiny(seed + 100).kernel) if seed % 2 else world]))
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_brute_force_lies_in_the_bracket_of_other_targets_and_longer_clocks(seed: int) -> None:
     world = tiny(seed, t_max=1)

@@ -155,13 +155,22 @@ def test_what_several_targets_cannot_do_is_refused(
     assert "targets.count=3: expected 2, as the policy has" in capsys.readouterr().err
 
 
+def below_the_bound(targets: Group, frames: int) -> float:
+    """How far per step a2c ends below the bound, at most."""
+    width: dict[str, Any] = {"evaluation.every": 1000, "evaluation.width": 0.02}
+    run = tm.train(targets, "a2c", total_frames=frames, **width, **{"optimal.enabled": False})
+    assert run.several is not None
+    low = run.several.figures.reward_per_step.low
+    assert low is not None
+    return run.several.upper / targets.expected_steps - low
+
+
+def test_a2c_with_joint_credit_learns_two_targets() -> None:
+    # It begins 1.1 below.
+    targets = tm.make_world(size=4, targets=2, exit_probability=0.05)
+    assert below_the_bound(targets, 40_960) < 0.5
+
+
 @pytest.mark.slow
 def test_a2c_with_joint_credit_learns_two_targets_to_within_a_tenth_of_the_bracket() -> None:
-    targets = tm.make_world(size=4, targets=2, exit_probability=0.05)
-    run = tm.train(
-        targets, "a2c", total_frames=204_800, **{"evaluation.every": 50, "evaluation.width": 0.01}
-    )
-    assert run.several is not None
-    found = run.several.figures.reward_per_step
-    assert found.low is not None
-    assert run.several.upper / targets.expected_steps - found.low < 0.1
+    assert below_the_bound(tm.make_world(size=4, targets=2), 81_920) < 0.1
