@@ -119,6 +119,18 @@ def test_simulation_agrees_with_the_joint_chain(budget: int | None) -> None:
         assert exact.sensors_per_step.mean <= budget
 
 
+def test_no_sensors_at_all_leave_every_second_step_to_the_safe_action() -> None:
+    world = tiny(0)
+    group = Group([world] * 2)
+    rule = make_rule(group, [Policy.none(world)], "union")
+    exact, played = evaluate_group(rule), evaluate_group(rule, episodes=1_000)
+    assert played.sensors_per_step.mean == exact.sensors_per_step.mean == 0.0
+    low, high = played.safe_per_step.low, played.safe_per_step.high
+    assert low is not None
+    assert high is not None
+    assert low - 0.02 < exact.safe_per_step.mean < high + 0.02
+
+
 def test_targets_are_the_same_for_every_policy_and_order_does_not_matter() -> None:
     world = tm.make_world(size=4, exit_probability=0.1)
     group = Group([world] * 3)

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import trackmdp as tm
@@ -18,6 +20,7 @@ from trackmdp.app.cli import main
 from trackmdp.config import load_run_config
 from trackmdp.errors import Preempted, UserError
 from trackmdp.seeding import derive
+from trackmdp.solvers.group_tracker import GroupTracker
 from trackmdp.solvers.group_value import evaluate_group
 from trackmdp.solvers.joint_rule import JointRule
 from trackmdp.solvers.solve import solve
@@ -97,6 +100,29 @@ def test_the_environment_pays_what_the_figures_say() -> None:
     error = total.std() / np.sqrt(len(total))
     assert found.aihtr.high is not None
     assert abs(total.mean() - found.aihtr.mean) < 4 * error + found.aihtr.high - found.aihtr.mean
+
+
+class Alternating(TensorDictModuleBase):
+    """All sensors on after a step with none, and none after one with all."""
+
+    in_keys = ("action_history",)
+    out_keys = ("action",)
+
+    def forward(self, state: TensorDictBase) -> TensorDictBase:
+        return state.set("action", ~state["action_history"][:, 0])
+
+
+def test_a_network_is_shown_the_last_sets_in_simulations_and_by_a_tracker() -> None:
+    rule = JointRule(group(), Alternating(), torch.device("cpu"))
+    totals = evaluate_group(rule, episodes=30).totals
+    # The last step, in which nothing is paid, is the exit: of L steps every second one of L - 1 has all sensors on.
+    np.testing.assert_array_equal(totals[:, 3], 9 * (totals[:, 5] // 2))
+    tracker = GroupTracker(rule, [0, 4])
+    for _ in range(2):
+        assert tracker.sensors() == list(range(9))
+        tracker.report([1, 4])
+        assert tracker.sensors() == []
+        tracker.report([None, None])
 
 
 @pytest.mark.parametrize("merge", ["gains", "union"])
