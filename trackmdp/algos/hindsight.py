@@ -2,9 +2,10 @@
 
 Sensing never moves the target. With all sensors on, every path shows the detections and misses of any policy
 on it. Nothing else is read: neither the kernel nor a position that was not sensed, and no motion is estimated. The
-clocked actor and critic only lend credit: the worth of a detection while the actor's own chains are still poor. Where
-the next move does not depend on the cell alone, the learned sets are exchanged at the end on whole paths, which gets
-past the optima that no change of one set improves (`estimates/path_plans.py`).
+clocked actor and critic only lend credit: the worth of a detection while the actor's own chains are still poor. At the
+end the learned sets change jointly where that pays on paths that did not propose it, which gets past the optima that no
+change of one set improves (`joint_trials.py`; on whole paths, where the next move does not depend on the cell alone,
+`estimates/path_plans.py`).
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from trackmdp.algos.common import (
 from trackmdp.algos.estimates.alike import cell_classes
 from trackmdp.algos.estimates.path_plans import choose_plan
 from trackmdp.algos.hindsight_loss import HindsightLoss
+from trackmdp.algos.joint_trials import tried
 from trackmdp.algos.moves import MoveBuffer
 from trackmdp.algos.path_replay import Replay
 from trackmdp.algos.segments import InferredMoves, SegmentBuffer
@@ -47,6 +49,8 @@ from trackmdp.world.windows import Window
 _MOST_CELLS_OF_NETS = 4_096
 """Above, embeddings of each (cell, clock) take time and memory that tables do not. At N = 32 tables end .007 per step
 below the optimum where nets end .002 below, and both .002 after the exchange."""
+_DISCOUNT_OF_TRIALS = 0.95
+"""Nets learn faster with less, but what two sets gain together may come several detections later."""
 _LONGER = 4
 """As many fewer whole paths per update than paths put together from moves."""
 _LOSSES = ("clocked_actor", "clocked_critic", "actor", "critic")
@@ -86,7 +90,7 @@ class Hindsight:
         self.iterations = iterations + max(
             0, -(-(self.updates - alongside) // cfg.updates_per_iteration)
         )
-        self._generator = generator(seed, "hindsight", device=device)
+        self._generator, self._seed = generator(seed, "hindsight", device=device), seed
         # Whether another policy is better is judged on recordings that nothing was learned from.
         judges = cfg.exchange and not self._mixed
         self._buffer = _buffer(task, cfg.buffer_size, self._generator, seed if judges else None)
@@ -142,6 +146,7 @@ class Hindsight:
         """Counters, generator, moves, and once they exist the nets with all that trains them."""
         learner = self._learner
         return {
+            "seed": self._seed,
             "iteration": self._iteration,
             "update": self._update,
             "generator": self._generator.get_state(),
@@ -151,6 +156,7 @@ class Hindsight:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
+        self._seed = state["seed"]
         self._iteration, self._update = state["iteration"], state["update"]
         self._buffer.load_state_dict(state["buffer"])
         self._seen = None
@@ -171,17 +177,33 @@ class Hindsight:
             self.policy.explore.fill_(self.cfg.explore.at(self._iteration / self._collecting))
 
     def _exchanged(self, sets: sparse.csr_array) -> sparse.csr_array:
-        """The learned sets after exchange on whole paths, at the end."""
-        exchanges = self.cfg.exchange and self._update == self.updates
-        if not exchanges or isinstance(self._buffer, MoveBuffer) or self._buffer.judge is None:
+        """The learned sets after joint changes, at the end."""
+        if not self.cfg.exchange or self._mixed or self._update < self.updates:
             return sets
+        if isinstance(self._buffer, MoveBuffer):
+            return self._after_trials(self._buffer, sets)
         paths, judge = self._buffer.tracks(), self._buffer.judge
+        assert judge is not None
         learned = PolicyTable(self.task, sets)
         others = [lambda _: learned]  # no validation path was learned from
         found = choose_plan(
             self.task, paths, priors=(), others=others, discount=self.cfg.gamma, seed=judge
         )
         return found.policy.sets
+
+    def _after_trials(self, buffer: MoveBuffer, sets: sparse.csr_array) -> sparse.csr_array:
+        """The sets after trials; as they are where nets do not reach, or where cells share them."""
+        task = self.task
+        if not task.safe or not self.hidden or self._classes is not None:
+            return sets
+
+        # Of its own, so that a finished run that is loaded again ends with the same sets.
+        rng = generator(self._seed, "trials", device=self.device)
+
+        def draw() -> IndexArray:
+            return buffer.paths(self.cfg.batch_size, task.t_max + 2, rng).cpu().numpy()
+
+        return tried(task, sets, draw, _DISCOUNT_OF_TRIALS)
 
     def _make_learner(self, reach: int) -> _Learner:
         loss = HindsightLoss(

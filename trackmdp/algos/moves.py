@@ -171,13 +171,14 @@ class MoveBuffer:
         start, end = self._appended().long()
         return start, end
 
-    def paths(self, count: int, steps: int) -> Tensor:
+    def paths(self, count: int, steps: int, generator: torch.Generator | None = None) -> Tensor:
         """`[steps + 1, count]` int64 cells of `count` paths, M from the exit on; every cell starts equally many.
 
-        The first moves are stratified: out of each cell the paths leave in the proportions of the moves seen.
+        The first moves are stratified: out of each cell the paths leave in the proportions of the moves seen. They are
+        drawn by the `generator`, or by the buffer's own.
         """
         ends, index = self._index = self._index or self._sort()
-        start, draws = stratified_starts(count, steps, self.num_cells, self._generator)
+        start, draws = stratified_starts(count, steps, self.num_cells, generator or self._generator)
         cells = [start]
         for draw in draws:
             # M starts no move: its place is the entry behind all moves, which is M again.

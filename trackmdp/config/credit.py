@@ -77,8 +77,8 @@ class PerSensorConfig(EveryTaskConfig):
         words=("all", "none"),
     )
     exchange: bool = option(
-        "where the next move does not depend on the cell alone, with collect=all_on: at the end, change learned sets "
-        "jointly where it pays on a quarter of the sensed paths, kept from learning"
+        "with collect=all_on: at the end, change learned sets jointly where it pays on other paths than those that "
+        "propose it; whole ones, a quarter kept from learning, where the next move does not depend on the cell alone"
     )
     max_entries: int = option(
         "entries (located cell, misses, sensor) of the losses' tables at once; larger ones are gone through in parts",
