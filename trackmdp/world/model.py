@@ -285,11 +285,6 @@ class Task(Carded):
             return sparse.diags_array(self.detection, format="csr")
         return sparse.csr_array(self.coverage.matrix.multiply(self.detection).T.tocsr())
 
-    @property
-    def safe_misses(self) -> Array | float:
-        """`[M]` 1 - p_s; simply 0.0 where the safe action always locates."""
-        return 0.0 if self.safe else 1.0 - self.safe_detection
-
     @cached_property
     def keys(self) -> KeySpace:
         """The keys that a policy may have at a detection; with `memory` "cell" the cells, or (cell, mode)."""

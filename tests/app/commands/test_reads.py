@@ -26,6 +26,8 @@ DEFAULTS = {
 
 OF_BLOCKS = {"partition.halo", "partition.workers", "partition.cluster"}
 """Read where there are blocks alone, which `test_blocks` learns by."""
+OF_SEVERAL = {"targets.merge", "evaluation.width"}
+"""Read with several targets alone."""
 MIXED = " algo=hindsight algo.updates=2 algo.collect=mixed collector.frames_per_batch=512 algo.explore.until=0.9"
 
 
@@ -47,20 +49,25 @@ def test_train_reads_every_option(algo: str, tmp_path: Path) -> None:
             "model_based": " algo.sensing=chosen algo.warm_up=1024 algo.estimate=paths",
         }.get(algo, "")
     )
-    assert never_read("train", words, tmp_path) == OF_BLOCKS
+    assert never_read("train", words, tmp_path) == OF_BLOCKS | OF_SEVERAL
+
+
+def test_train_reads_the_options_of_several_targets(tmp_path: Path) -> None:
+    words = f"algo=model_based {SHORT} optimal.nodes=100000 grid.t_max=0 targets.count=2"
+    assert not never_read("train", words, tmp_path) & OF_SEVERAL
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("collector", ["multi_sync", "multi_async"])
 def test_collectors_with_workers_read_every_option(collector: str, tmp_path: Path) -> None:
-    assert never_read("train", f"collector={collector} {SHORT}{MIXED}", tmp_path) == OF_BLOCKS
+    words = f"collector={collector} {SHORT}{MIXED}"
+    assert never_read("train", words, tmp_path) == OF_BLOCKS | OF_SEVERAL
 
 
 @pytest.mark.parametrize("baseline", BASELINES)
 def test_evaluate_reads_every_option(baseline: str, tmp_path: Path) -> None:
-    # Those of several targets are read with them alone.
     words = f"baseline={baseline} grid.size=3 quiet=true episodes=10"
-    assert never_read("evaluate", words, tmp_path) == {"targets.merge", "evaluation.width"}
+    assert never_read("evaluate", words, tmp_path) == OF_SEVERAL
 
 
 def test_evaluate_reads_the_options_of_several_targets(tmp_path: Path) -> None:
