@@ -55,6 +55,15 @@ def test_the_optimum_stays_where_few_paths_judge() -> None:
     assert (after(best, each=20).sets != best.sets).nnz == 0
 
 
+def test_paths_may_all_end_before_the_last_step() -> None:
+    """The target leaves from the last cell at once: no path that begins there is left to be missed."""
+    kernel = WALK.kernel.toarray()
+    kernel[-1] = 0.0
+    world = tm.World(kernel, 4, cost=0.4, t_max=WALK.t_max)
+    best = tm.solve(world).table
+    assert (tried(world, best.sets, Draws(world, 200), 0.95) != best.sets).nnz == 0
+
+
 def test_no_proposal_is_taken_that_other_paths_do_not_confirm() -> None:
     """Sets that fit one path from each cell are poor on others."""
     best, few, many, drawn = tm.solve(WALK).table, Draws(WALK, 1), Draws(WALK, 200), 0

@@ -112,7 +112,8 @@ class _Ways:
             found = mass * turn.choice.report(on)
             chances.append(sparse.csr_array((found[:, 0], (turn.rows, end)), shape=(count, count)))
             mass = mass - found
-        rows = sparse.csr_array((mass[:, 0], (turn.rows, np.arange(len(mass)))))
+        last = (turn.rows, np.arange(len(mass)))
+        rows = sparse.csr_array((mass[:, 0], last), shape=(count, len(mass)))
         located = sum(chances, rows @ self._last)
         earned = plans.worth(candidates_of(sets))[:, 0]
         return spsolve(sparse.eye_array(count, format="csc") - located.tocsc(), earned)
