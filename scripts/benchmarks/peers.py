@@ -51,7 +51,7 @@ class Learned:
 def rows(
     words: Mapping[str, str],
     seeds: tuple[int, ...] = (0, 1, 2),
-    algos: tuple[str, ...] = ("hindsight", "ppo", "a2c"),
+    algos: tuple[str, ...] = ("model_based", "hindsight", "ppo", "a2c"),
     peers: str = "scripts/peers",
     peers_seconds: float = 180.0,
 ) -> Iterator[Row]:
