@@ -6,12 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 import trackmdp as tm
 from trackmdp.errors import UserError
+from trackmdp.policies.saved import packed
 from trackmdp.world.gridding import Gridding, said, to_tracks
 from trackmdp.world.positions import Positions, table_of
 from trackmdp.world.tracks import Recorded, Tracks
@@ -44,7 +46,7 @@ def cells(tracks: Tracks) -> list[list[int]]:
 
 
 def made(positions: Positions, **more: Any) -> tuple[Tracks, dict[str, int]]:
-    return to_tracks(positions, grid(**more), "here")[:2]
+    return to_tracks(positions, grid(**more), "here", np.array([]))[:2]
 
 
 def test_between_reports_a_straight_line() -> None:
@@ -303,9 +305,40 @@ def test_the_city_is_read_from_python() -> None:
     place = first.first[first.names.tolist().index(0)]
     x, y = np.loadtxt(CITY, delimiter=",", skiprows=1, max_rows=1)[2:]
     everything = np.loadtxt(CITY, delimiter=",", skiprows=1)
-    low = np.percentile(everything[:, 2:], (1, 99), axis=0).mean(axis=0) - [15 * 25, 18 * 25]
+    seen = everything[~np.isin(everything[:, 0], tracks.held_out.names)]
+    low = np.percentile(seen[:, 2:], (1, 99), axis=0).mean(axis=0) - [15 * 25, 18 * 25]
     column, up = ((np.array([x, y]) - low) // 50).astype(int)
     assert first.cells[place] == (17 - up) * 15 + column
+
+
+@pytest.mark.parametrize("geographic", [False, True])
+def test_a_held_out_track_far_away_changes_nothing_that_is_learned(geographic: bool) -> None:
+    """Neither the place of the grid, nor which tracks are drawn, nor the policy."""
+    rng = np.random.default_rng(0)
+    at = rng.uniform(0, 40, (40, 1, 2)) + rng.normal(0, 4, (40, 12, 2)).cumsum(axis=1)
+    name, step = (each.ravel() for each in np.indices((40, 12)))
+
+    def learned(shift: float, moved: Any) -> tuple[Recorded, Any]:
+        x, y = np.moveaxis(at + shift * np.isin(np.arange(40), moved)[:, None, None], 2, 0)
+        # A ten-thousandth of a degree is 7 to 11 m here; the shift leaves the UTM zone.
+        wide = {"lon": 9 + x / 1e5, "lat": 47 + y / 1e5} if geographic else {"x": x, "y": y}
+        table = {"id": 100 + name, "t": 5.0 * step} | {
+            key: each.ravel() for key, each in wide.items()
+        }
+        options = {"cell": 10.0, "step": 5.0, "min_length": 2, "cost": 0.1}
+        recorded = tm.load_tracks(pd.DataFrame(table), (9, 9), **options)
+        return recorded, tm.train(recorded, "model_based", seed=0).policy
+
+    first, policy = learned(0.0, [])
+    away, again = learned(1e6, first.held_out.names[:-1])
+    assert (len(first.held_out), len(away.held_out)) == (8, 1)
+    assert away.place == first.place
+    for part in ("tracks", "validation"):
+        assert getattr(away, part).digest() == getattr(first, part).digest()
+    assert packed(again).keys() == packed(policy).keys()
+    assert all(map(np.array_equal, packed(again).values(), packed(policy).values()))
+    with pytest.raises(UserError, match=r"leave, of \d+ tracks, none to judge on"):
+        learned(1e6, first.held_out.names)
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,7 @@ class GridConfig(NodeConfig):
     )
     origin: list[float] | None = option(
         "corner of the grid with the least coordinates, [x, y] or [lon, lat]; null = not known, with kernel=tracks the "
-        "middles of grid and positions agree"
+        "middle of the positions that are not held out"
     )
     crs: str | None = option(
         "projection of lat, lon to metres; null = positions are x, y, with kernel=tracks the UTM zone of lat, lon",

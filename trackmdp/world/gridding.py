@@ -33,8 +33,8 @@ class Gridding:
         shortest: fewest cells of a track.
         exits: whether a target has left the grid at its last report.
         origin: the corner of the grid with the smallest coordinates, in the file's coordinates; None: grid and
-            positions have the same middle.
-        crs: projected coordinate system for degrees, such as ``EPSG:2056``; None: the UTM zone of the median.
+            positions that are not held out have the same middle.
+        crs: projected coordinate system for degrees, such as ``EPSG:2056``; None: the UTM zone of their median.
     """
 
     size: tuple[int, int]
@@ -48,7 +48,7 @@ class Gridding:
 
 
 def to_tracks(
-    positions: Positions, grid: Gridding, source: str
+    positions: Positions, grid: Gridding, source: str, held_out: np.ndarray
 ) -> tuple[Tracks, dict[str, int], Place]:
     """The tracks, the counts of reports read, cut or dropped, and the place of the grid.
 
@@ -59,11 +59,12 @@ def to_tracks(
         positions: of all targets.
         grid: size, cells and steps of the tracks.
         source: begins a message.
+        held_out: targets that have no say in where the grid lies, since nothing is learned from them.
 
     Raises:
         UserError: the projection does not fit the positions, or no track is left.
     """
-    flat, place = _placed(positions, grid, source)
+    flat, place = _placed(positions, grid, source, ~np.isin(positions.track, held_out))
     begin, x, y, last = _sampled(flat, grid)
     cells = place.cells(x, y, grid.size)
     tracks, counts = _cut(cells, begin, last, flat.track, grid)
@@ -86,25 +87,31 @@ def said(report: Mapping[str, int]) -> str:
     return ", ".join(f"{count:,} {what}" for what, count in report.items() if count)
 
 
-def _placed(positions: Positions, grid: Gridding, source: str) -> tuple[Positions, Place]:
-    """The positions in metres, and the place of the grid."""
+def _placed(
+    positions: Positions, grid: Gridding, source: str, says: np.ndarray
+) -> tuple[Positions, Place]:
+    """The positions in metres, and the place of the grid, which those in `says` `[P]` decide."""
     code, flat = None, positions
     if positions.geographic:
-        code = grid.crs or _utm(positions, source)
+        code = grid.crs or _utm(positions.x[says], positions.y[says], source)
         x, y = map(np.asarray, projection(code).transform(positions.x, positions.y))
         flat = replace(positions, x=x, y=y)  # inf where the projection does not reach
     elif grid.crs is not None:
         raise UserError(
             f"{source}: has x and y, which are not projected; grid.crs={grid.crs} is for lat and lon"
         )
-    corner = _middle(flat, grid) if grid.origin is None else projected(code, grid.origin)
+    corner = (
+        _middle(flat.x[says], flat.y[says], grid)
+        if grid.origin is None
+        else projected(code, grid.origin)
+    )
     return flat, Place(corner, grid.cell, code, positions.downwards)
 
 
-def _utm(positions: Positions, source: str) -> str:
+def _utm(x: Array, y: Array, source: str) -> str:
     """The code of the UTM zone in which the median position lies."""
-    low, high = np.percentile(positions.x, (1, 99))
-    latitude = float(np.median(positions.y))
+    low, high = np.percentile(x, (1, 99))
+    latitude = float(np.median(y))
     if high - low > _WIDEST or abs(latitude) > 84:
         raise UserError(
             f"{source}: from {low:.1f} to {high:.1f} degrees of longitude, at latitude {latitude:.1f}, is no part of "
@@ -112,7 +119,7 @@ def _utm(positions: Positions, source: str) -> str:
         )
     # Zones of 6 degrees from 180 W on: 8.5 E is in 1 + floor(188.5 / 6) = 32. The code of the north serves the south
     # too, where y is then negative: only differences count here.
-    zone = min(60, 1 + int((float(np.median(positions.x)) + 180.0) // 6.0))
+    zone = min(60, 1 + int((float(np.median(x)) + 180.0) // 6.0))
 
     return f"EPSG:326{zone:02d}"
 
@@ -159,16 +166,16 @@ def _sampled(positions: Positions, grid: Gridding) -> tuple[np.ndarray, Array, A
     return start[of], x, y, final[of]
 
 
-def _middle(positions: Positions, grid: Gridding) -> tuple[float, float]:
+def _middle(x: Array, y: Array, grid: Gridding) -> tuple[float, float]:
     """The smallest x and y of the grid, in metres, if grid and positions have the same middle."""
     # Half way between the 1st and the 99th percentile: a few reports from nowhere do not move the grid.
-    known = [column[np.isfinite(column)] for column in (positions.x, positions.y)]
+    known = [column[np.isfinite(column)] for column in (x, y)]
     # Without one the grid may lie anywhere.
-    x, y = (
+    right, up = (
         float(np.percentile(column, (1, 99)).mean()) if len(column) else 0.0 for column in known
     )
     rows, columns = grid.size
-    return x - columns * grid.cell / 2, y - rows * grid.cell / 2
+    return right - columns * grid.cell / 2, up - rows * grid.cell / 2
 
 
 def _cut(

@@ -25,7 +25,7 @@ from trackmdp.world.kernel_checks import PRICES, PROBABILITIES, canonical_kernel
 from trackmdp.world.model import TASK_BYTES, Size, World, check_fits, grid_size
 from trackmdp.world.place import Place
 from trackmdp.world.track_files import read_track_file
-from trackmdp.world.tracks import Problem, Recorded, modelled, split
+from trackmdp.world.tracks import Problem, Recorded, modelled
 
 OF_TASK = {
     "size": "grid.size",
@@ -262,15 +262,15 @@ def recorded(
     shortest = max(
         min_length or of_task["t_max"] + 3, 1 if ends == "exit" else 2
     )  # a cut track of one has no step
-    tracks, loaded, place = read_track_file(
+    (mine, chosen, judged), loaded, place = read_track_file(
         path if frame is None else frame,
         grid_size(size),
         ends == "exit",
         shortest,
         format,
         gridding | {"columns": columns},
+        (held_out, validation, seed),
     )
-    mine, chosen, judged = split(tracks, held_out, validation, seed)
     return Recorded(
         mine, size, validation=chosen, held_out=judged, loaded=loaded, place=place, **of_task
     )

@@ -22,12 +22,16 @@ from trackmdp.world.positions import (
     position_table,
     sumo,
 )
-from trackmdp.world.tracks import Tracks, check_tracks, read_tracks
+from trackmdp.world.tracks import Tracks, check_tracks, draw_names, read_tracks, split
 
 _GAP = 3
 """Steps that are bridged where no `kernel.max_gap` is given."""
 
 Reader: TypeAlias = Callable[..., Positions]
+Parts: TypeAlias = tuple[Tracks, Tracks, Tracks]
+"""Tracks to learn from, to choose by, and held out."""
+Draw: TypeAlias = tuple[float, float, int]
+"""Shares held out and to choose by, and the seed of the draw."""
 
 
 _READERS: dict[str, tuple[Sequence[str], str, Sequence[str], Reader]] = {
@@ -81,8 +85,9 @@ def read_track_file(
     shortest: int,
     format: str | None,
     given: Mapping[str, Any],
-) -> tuple[Tracks, Mapping[str, int], Place | None]:
-    """The tracks in a file, the counts of reports read, cut and dropped, and the place of the grid.
+    draw: Draw,
+) -> tuple[Parts, Mapping[str, int], Place | None]:
+    """The three parts of the tracks, the counts of reports read, cut and dropped, and the place of the grid.
 
     Of cells nothing is dropped, and their place is the one by hand.
 
@@ -93,9 +98,11 @@ def read_track_file(
         shortest: fewest cells of a track.
         format: one of the choices of `kernel.format`; None: by the ending of the name and the columns.
         given: `step`, `cell`, `max_gap`, `origin` and `crs` (`Gridding`), and `columns`; None where not given.
+        draw: as of `tracks.draw_names`.
 
     Raises:
-        UserError: the file is not of that form, an option is missing or does not go with it, or no track is left.
+        UserError: the file is not of that form, an option is missing or does not go with it, or of a part no track is
+            left.
     """
     own = {name: value for name, value in given.items() if value is not None}
     columns = tuple(own.pop("columns", ()))
@@ -109,7 +116,8 @@ def read_track_file(
                     f"kernel.{name}={own[name]}: only for positions; {source} holds cells"
                 )
         place = Place.of(*(given[name] for name in ("cell", "origin", "crs")))
-        return check_tracks(read_tracks(path, size, exits=exits), shortest, source), {}, place
+        tracks = check_tracks(read_tracks(path, size, exits=exits), shortest, source)
+        return split(tracks, *draw), {}, place
     for option, expected in (
         ("kernel.step", "seconds from one cell to the next"),
         ("grid.cell", "the side of a cell in metres"),
@@ -125,15 +133,25 @@ def read_track_file(
     if in_memory:
         with decoded(source, "a table of positions"):
             positions = frame_positions(path, columns)
-        return to_tracks(positions, made, source)
-    return once(_on_grid, path, format or kind, made, columns)
+        return _on_grid(positions, made, source, draw)
+    return once(_read_on_grid, path, format or kind, made, columns, draw)
+
+
+def _read_on_grid(
+    path: str | Path, kind: str, grid: Gridding, columns: Sequence[str], draw: Draw
+) -> tuple[Parts, Mapping[str, int], Place]:
+    """See `read_track_file`."""
+    return _on_grid(read_positions(path, kind, columns), grid, f"kernel.path={path}", draw)
 
 
 def _on_grid(
-    path: str | Path, kind: str, grid: Gridding, columns: Sequence[str]
-) -> tuple[Tracks, Mapping[str, int], Place]:
+    positions: Positions, grid: Gridding, source: str, draw: Draw
+) -> tuple[Parts, Mapping[str, int], Place]:
     """See `read_track_file`."""
-    return to_tracks(read_positions(path, kind, columns), grid, f"kernel.path={path}")
+    # Drawn first: what is held out must not move the grid, nor change the draw by leaving it.
+    held_out, _ = draw_names(positions.track, *draw)
+    tracks, loaded, place = to_tracks(positions, grid, source, held_out)
+    return split(tracks, *draw, names=positions.track), loaded, place
 
 
 def _format_of(path: str | Path) -> str:

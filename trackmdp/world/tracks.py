@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias, Unpack
@@ -263,7 +263,7 @@ def check_tracks(tracks: Tracks, shortest: int, source: str) -> Tracks:
 
 
 def split(
-    tracks: Tracks, held_out: float, validation: float, seed: int
+    tracks: Tracks, held_out: float, validation: float, seed: int, *, names: Indices | None = None
 ) -> tuple[Tracks, Tracks, Tracks]:
     """Three parts drawn at random: to learn from, to choose between policies by, and held out for the last figures.
 
@@ -272,35 +272,55 @@ def split(
 
     Args:
         tracks: all of them.
+        held_out: as of `draw_names`, like the following.
+        validation: see `held_out`.
+        seed: see `held_out`.
+        names: of the targets that the parts are drawn from, also those without a track here; None: of the tracks.
+
+    Raises:
+        UserError: one of the three parts is empty.
+    """
+    own = tracks.names
+    drawings = draw_names(own if names is None else names, held_out, validation, seed)
+    judged, chosen = (np.isin(own, each) for each in drawings)
+    learned = ~(judged | chosen)
+    _check_parts((judged.sum(), chosen.sum(), learned.sum()), held_out, validation)
+    return tracks.select(learned), tracks.select(chosen), tracks.select(judged)
+
+
+def draw_names(
+    names: Indices, held_out: float, validation: float, seed: int
+) -> tuple[Indices, Indices]:
+    """The names of targets to hold out and of those to choose between policies by, drawn at random.
+
+    Args:
+        names: of all targets; repeated ones count once.
         held_out: about this share of the names is held out; which ones does not depend on `validation`.
         validation: share of the names to choose by.
         seed: of the draw.
 
     Raises:
-        UserError: one of the three parts is empty.
+        UserError: one of the two is empty, or no name is left to learn from.
     """
-    number = len(np.unique(tracks.names))
-    last, middle = round(held_out * number), round(validation * number)
-    counts = {"judge on": last, "choose by": middle, "learn from": number - last - middle}
-    for words, count in counts.items():
+    order = shuffled(names, derive(seed, "held_out"))
+    last, middle = (round(share * len(order)) for share in (held_out, validation))
+    _check_parts((last, middle, len(order) - last - middle), held_out, validation)
+    return order[:last], order[last : last + middle]
+
+
+def _check_parts(counts: tuple[int, int, int], held_out: float, validation: float) -> None:
+    for count, words in zip(counts, ("judge on", "choose by", "learn from"), strict=True):
         if count < 1:
             raise UserError(
-                f"kernel.held_out={held_out}, kernel.validation={validation}: leave, of {number} tracks, none to "
+                f"kernel.held_out={held_out}, kernel.validation={validation}: leave, of {sum(counts)} tracks, none to "
                 f"{words}; expected at least one for each"
             )
-    judged, chosen, learned = draw_parts(tracks, [last, middle], derive(seed, "held_out"))
-    return learned, chosen, judged
 
 
-def draw_parts(tracks: Tracks, counts: Sequence[int], seed: int) -> list[Tracks]:
-    """Parts of so many names each, drawn, and the rest; tracks of one name are in one part."""
-    names, of_name = np.unique(tracks.names, return_inverse=True)
-    # Example: of 10 names, with counts 2 and 1, the permutation 7 2 9 0 ... puts 7 and 2 into part 0 and 9 into part 1.
-    part = np.full(len(names), len(counts))
-    part[np.random.default_rng(seed).permutation(len(names))[: sum(counts)]] = np.repeat(
-        np.arange(len(counts)), counts
-    )
-    return [tracks.select(part[of_name] == each) for each in range(len(counts) + 1)]
+def shuffled(names: Indices, seed: int) -> Indices:
+    """The names, each once, in a random order."""
+    names = np.unique(names)
+    return names[np.random.default_rng(seed).permutation(len(names))]
 
 
 def ends_of(lengths: Indices) -> Indices:

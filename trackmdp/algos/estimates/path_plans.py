@@ -24,7 +24,7 @@ from trackmdp.solvers.plans import Layout, Plans, Turn
 from trackmdp.solvers.search import candidates_of, columns_of
 from trackmdp.solvers.sensing import sensing
 from trackmdp.world.model import Array, Task
-from trackmdp.world.tracks import Tracks, draw_parts
+from trackmdp.world.tracks import Tracks, shuffled
 
 PRIORS = (1.0, 3.0, 10.0, 30.0, 100.0)
 """Weights of the prior mean that are tried."""
@@ -100,9 +100,9 @@ def choose_plan(
 
 def parted(tracks: Tracks, seed: int) -> tuple[Tracks, Tracks]:
     """Paths to learn from and paths to judge by, a quarter of the names; no recording is in both."""
-    count = round(len(np.unique(tracks.names)) * _JUDGED)
-    judge, rest = draw_parts(tracks, [count], derive(seed, "judge"))
-    return (rest, judge) if count else (tracks, judge)
+    names = shuffled(tracks.names, derive(seed, "judge"))
+    judges = np.isin(tracks.names, names[: round(len(names) * _JUDGED)])
+    return tracks.select(~judges), tracks.select(judges)
 
 
 def _searched(paths: Paths, plan: Planned) -> Planned:
