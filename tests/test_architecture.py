@@ -302,8 +302,7 @@ def long_functions(tree: ast.AST) -> list[str]:
 
 def test_functions_are_short() -> None:
     found = {module: long_functions(tree) for module, tree in trees().items()}
-    known = {"trackmdp.algos.hindsight_loss", "trackmdp.algos.estimates.path_plans"}
-    assert {module for module, names in found.items() if names} <= known
+    assert not {module: names for module, names in found.items() if names}
 
 
 def test_long_functions_are_seen_and_docstrings_not_counted() -> None:

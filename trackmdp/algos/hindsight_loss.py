@@ -93,7 +93,8 @@ class HindsightLoss(nn.Module):
         super().__init__()
         # Shapes below: M cells, T + 1 = t_max + 1 clocks, B paths, C cells of a window around the located cell, and K
         # sensors that may see them, one in each where none has a footprint.
-        m, choices, device = task.num_keys, task.num_choices, generator.device
+        choices, device = task.num_choices, generator.device
+        self._task, self._generator = task, generator
         self.reach, self._window, self._keys, self._classes = (
             reach,
             task.numbered,
@@ -106,16 +107,31 @@ class HindsightLoss(nn.Module):
             _in_view(task, choices * reach, device),
         )
         self.nearby, self.sensors = SensorsInView(task, self.near), SensorsInView(task, self.view)
+        self._make_nets(hidden, classes)
+        actor_loss.allocate((task.num_keys, choices, self.sensors.width), device)
+        self.actor_loss = actor_loss
+        self.discount = discount
+        entries = max(self.sensors.entries, self.near.width * self._classes)
+        self._keys_at_once = max(1, max_entries // (choices * entries))
+        self._keep_prices()
+        self.clocks = nn.Buffer(torch.arange(choices, device=device).unsqueeze(-1))
+        # Row 0 for the clocked actor, row 1 for the actor.
+        self.gain_scale = nn.Buffer(torch.ones(2, choices, device=device))
+
+    def _make_nets(self, hidden: int, classes: IndexArray | None) -> None:
+        task, generator, choices = self._task, self._generator, self._task.num_choices
         # The border looks alike from two cells where it is equally far, or out of reach until the safe action; and so
         # must all classes of cells do that the target may come to before it.
         # The sets are then learned once for both; values stay each cell's own.
         groups = None
         if classes is not None:
             groups = self._groups(
-                Window(task, choices * reach, device), torch.as_tensor(classes, device=device)
+                Window(task, choices * self.reach, generator.device),
+                torch.as_tensor(classes, device=generator.device),
             )
-
-        net = partial(CellClockNet, m, hidden=hidden, generator=generator, classes=self._classes)
+        net = partial(
+            CellClockNet, task.num_keys, hidden=hidden, generator=generator, classes=self._classes
+        )
 
         def decisions(seen: Window, sensors: SensorsInView) -> CellClockNet:
             # Where the window is the whole grid an output stands for a cell, and cannot be shared. Bias -1 starts all
@@ -134,14 +150,14 @@ class HindsightLoss(nn.Module):
             decisions(self.near, self.nearby),
             net(choices + 1, outputs=1),
         )
-        actor_loss.allocate((m, choices, self.sensors.width), device)
-        self.actor_loss = actor_loss
-        self.discount, self.safe_cost = discount, task.safe_cost / task.reward
+
+    def _keep_prices(self) -> None:
+        """Prices in units of r, and p_s."""
+        task, device = self._task, self._generator.device
+        self.safe_cost = task.safe_cost / task.reward
         # Reward of the forced step, in units of r: (r - D) / r; or about the sum of all until one locates.
         safe = float(task.safe_detection.mean())
-        self._forced = (safe - self.safe_cost) / (1.0 - discount * (1.0 - safe))
-        entries = max(self.sensors.entries, self.near.width * self._classes)
-        self._keys_at_once = max(1, max_entries // (choices * entries))
+        self._forced = (safe - self.safe_cost) / (1.0 - self.discount * (1.0 - safe))
         # A sensor that does not exist reports nothing, and is learned to be off by a price like the others'.
         price = np.where(task.available, task.cost, np.nanmean(task.cost))
         cost = torch.as_tensor(price / task.reward, dtype=torch.float32, device=device)
@@ -152,10 +168,6 @@ class HindsightLoss(nn.Module):
         locates = torch.as_tensor(task.safe_detection, dtype=torch.float32, device=device)
         every = pad(locates.repeat_interleave(self._classes), (0, 1))
         self._safe_detection = None if task.safe else every
-        self._task, self._generator = task, generator
-        self.clocks = nn.Buffer(torch.arange(choices, device=device).unsqueeze(-1))
-        # Row 0 for the clocked actor, row 1 for the actor.
-        self.gain_scale = nn.Buffer(torch.ones(2, choices, device=device))
 
     def _groups(self, window: Window, alike: Tensor) -> Tensor:
         """`[M]` the groups of located cells, or of keys: those of their cells and of one class."""
@@ -182,10 +194,7 @@ class HindsightLoss(nn.Module):
             replay = Replay(self._task, self.view, found, self._generator)
         exploring = max(_EXPLORING_AT_END, (1.0 - blend) / 2)
         cells, own = replay.begin(cells, exploring) if replay else (cells, cells)
-        clocked, value = self.clocked_critic().squeeze(-1), self.critic().squeeze(-1)
-        # U(x, T+1) holds r - D for certain; the net learns the rest.
-        clocked = torch.cat([clocked[:, :-1], clocked[:, -1:] + self._forced], dim=1)
-        value = torch.cat([value[:, :1], value[:, 1:] + self._forced], dim=1)
+        clocked, value = self._values()
         # [T + 1, M + 1], nothing gained by sensing an exited target. Detached: decisions do not train the values.
         advantage = pad(clocked_advantage(clocked.detach()), (0, 1))
         plans = self._replay(replay, cells, own, (on, found), advantage, value.detach(), blend)
@@ -195,8 +204,7 @@ class HindsightLoss(nn.Module):
         )
         # [M + 1, T + 2], U = 0 once exited.
         known, targets = pad(clocked.detach(), (0, 0, 0, 1)), []
-        slices = self.slices()
-        for rows in slices:
+        for rows in (slices := self.slices()):
             chosen = self._paths_from(cells[0], rows)
             loss, target = self._clocked(cells[:2, chosen], rows, advantage, known)
             actor_loss = self._own(
@@ -210,16 +218,17 @@ class HindsightLoss(nn.Module):
                 "clocked_actor": (loss * weights[0]).sum(),
             }
             if rows is slices[-1]:
-                visits, begun = (
-                    torch.bincount(paths[0], minlength=len(value)) for paths in (own, cells)
-                )
-                # The squared error per cell times its number of paths is, up to a constant, the sum over paths of (V -
-                # return)^2.
-                losses["critic"] = _squared_error(value, plans.target, visits) / cells.shape[1]
-                losses["clocked_critic"] = (
-                    _squared_error(clocked, torch.cat(targets), begun) / cells.shape[1]
-                )
+                begun = cells[0], torch.cat(targets)
+                losses["critic"] = _squared_error(value, own[0], plans.target)
+                losses["clocked_critic"] = _squared_error(clocked, *begun)
             yield losses
+
+    def _values(self) -> tuple[Tensor, Tensor]:
+        """U `[M, T+2]` and V `[M, 1]`, or V and L `[M, 2]`."""
+        clocked, value = self.clocked_critic().squeeze(-1), self.critic().squeeze(-1)
+        # U(x, T+1) holds r - D for certain; the net learns the rest.
+        clocked = torch.cat([clocked[:, :-1], clocked[:, -1:] + self._forced], dim=1)
+        return clocked, torch.cat([value[:, :1], value[:, 1:] + self._forced], dim=1)
 
     def slices(self) -> list[slice]:
         """The located cells, as many at once as `max_entries` allows."""
@@ -251,24 +260,11 @@ class HindsightLoss(nn.Module):
         Returns:
             The clocked actor's losses summed per clock, `[T+1]`, and the clocked critic's targets `[rows, T+2]`.
         """
-        near, m, h = self.near, self._keys.num_keys, self._classes
-        nearby, logits = self._of_keys(near.cells, rows), self.clocked_actor(rows)
-        count, k = nearby.shape
-        # [x, C H], the keys in those cells; M outside the grid.
-        ends = (
-            (nearby.unsqueeze(-1) * h + torch.arange(h, device=nearby.device))
-            .flatten(1)
-            .clamp_max(m)
-        )
-        start, end = moves
-        first = rows.start or 0
-        # Flat place in [rows, C H] of a move: with C = 9, H = 1, from cell 7 to its local cell 5 is 7 * 9 + 5 = 68;
-        # where the slice begins at cell 4, 68 - 36 = 32. Exits have weight 0, wherever `index` puts them.
-        place = (start * k + near.index(start // h, end // h) - first * k) * h + end % h
-        moved = scatter_add((end < m).float(), place, count * k * h).view(count, 1, k * h)
-        # moved [x, 1, C H] counts moves by their end; stays [x, 1] the moves that stay in the grid, visits [x, 1] all.
-        # Their quotients are the empirical kernel: moved / visits for P_xj, stays / visits for P_in(x).
-        stays, visits = moved.sum(-1), torch.bincount(start - first, minlength=count).unsqueeze(-1)
+        nearby, logits = self._of_keys(self.near.cells, rows), self.clocked_actor(rows)
+        k, h = nearby.shape[1], self._classes
+        ends = self._keys_of(nearby)
+        moved, visits = self._counted(moves, rows, len(nearby))
+        stays = moved.sum(-1)
         # advantage[:, ends] is [T + 1, x, C H]: transposed to the layout [x, T + 1, C H].
         gain = moved * sensing_gain(advantage[:, ends].transpose(0, 1), discount=self.discount)
         # All moves to a key have the same gain, so its sign makes it a part of its cell's G⁺ or G⁻.
@@ -289,25 +285,53 @@ class HindsightLoss(nn.Module):
                 minus * allowed,
                 cost * allowed,
             )
-        # [x, 1, C H] @ [x, C H, T + 2]: gamma sum_j moved_j U(j, n), for all n by one product.
-        following = self.discount * torch.bmm(moved, known[ends]).squeeze(1)
-        # U(x, n) = sum_j P_xj gamma U(j, n + 1), if nothing is sensed; each sensor on adds its gain, which turns gamma
-        # U(j, n + 1) into r + gamma U(j, 0), and takes its cost away. At n = T + 1 all are located: r - D + gamma U(j,
-        # 0).
+        # Each sensor on adds its gain, which turns gamma U(j, n + 1) into r + gamma U(j, 0), and takes its cost away.
         found = ((plus - minus) * self.nearby.reports(chosen, rows)).sum(-1)
-        free = following[:, 1:] + found - stays * (chosen * cost).sum(-1)
-        if self._safe_detection is None:
-            forced = following[:, :1] + (1.0 - self.safe_cost) * stays
-        else:  # a missed target goes on at n = T + 1
-            located = moved.squeeze(1) * self._safe_detection[ends]
-            after = located * (1.0 + self.discount * known[ends, 0])
-            missed = (moved.squeeze(1) - located) * self.discount * known[ends, -1]
-            forced = (after + missed).sum(-1, keepdim=True) - self.safe_cost * stays
-        target = torch.cat([free, forced], dim=1) / visits.clamp(min=1)
+        sensed = found, stays * (chosen * cost).sum(-1)
+        target = self._clocked_returns(moved, known[ends], ends, sensed) / visits.clamp(min=1)
         # The price is c for every move that stays in the grid.
         plus, minus = (self.nearby.gains(each, chosen, rows) for each in (plus, minus))
         loss = decision_loss(logits, plus, minus, stays.unsqueeze(-1) * cost)
         return loss.sum((0, 2)), target
+
+    def _keys_of(self, cells: Tensor) -> Tensor:
+        """`[x, C H]`, the keys in `cells` `[x, C]`; M outside the grid."""
+        h = self._classes
+        keys = cells.unsqueeze(-1) * h + torch.arange(h, device=cells.device)
+        return keys.flatten(1).clamp_max(self._keys.num_keys)
+
+    def _counted(self, moves: Tensor, rows: slice, count: int) -> tuple[Tensor, Tensor]:
+        """`[x, 1, C H]`, the moves from each of `count` keys by their end, and `[x, 1]` all, exits included.
+
+        Their quotient is the empirical kernel P_xj.
+        """
+        k, h, m = self.near.width, self._classes, self._keys.num_keys
+        (start, end), first = moves, rows.start or 0
+        # Flat place in [rows, C H] of a move: with C = 9, H = 1, from cell 7 to its local cell 5 is 7 * 9 + 5 = 68;
+        # where the slice begins at cell 4, 68 - 36 = 32. Exits have weight 0, wherever `index` puts them.
+        place = (start * k + self.near.index(start // h, end // h) - first * k) * h + end % h
+        moved = scatter_add((end < m).float(), place, count * k * h).view(count, 1, k * h)
+        return moved, torch.bincount(start - first, minlength=count).unsqueeze(-1)
+
+    def _clocked_returns(
+        self, moved: Tensor, known: Tensor, ends: Tensor, sensed: tuple[Tensor, Tensor]
+    ) -> Tensor:
+        """`[x, T+2]`, sums over the moves from x of r, gamma U and prices; `sensed`: gains and prices, `[x, T+1]`.
+
+        U(x, n) = sum_j P_xj gamma U(j, n + 1), if nothing is sensed. At n = T + 1 all are located: r - D + gamma U(j,
+        0).
+        """
+        # [x, 1, C H] @ [x, C H, T + 2]: gamma sum_j moved_j U(j, n), for all n by one product.
+        following, stays = self.discount * torch.bmm(moved, known).squeeze(1), moved.sum(-1)
+        if self._safe_detection is None:
+            forced = following[:, :1] + (1.0 - self.safe_cost) * stays
+        else:  # a missed target goes on at n = T + 1
+            located = moved.squeeze(1) * self._safe_detection[ends]
+            after = located * (1.0 + self.discount * known[..., 0])
+            missed = (moved.squeeze(1) - located) * self.discount * known[..., -1]
+            forced = (after + missed).sum(-1, keepdim=True) - self.safe_cost * stays
+        found, spent = sensed
+        return torch.cat([following[:, 1:] + found - spent, forced], dim=1)
 
     def _of_keys(self, table: Tensor, rows: slice) -> Tensor:
         """`[rows, K]`, the rows of a table `[cells, K]` for located cells, or for the cells of keys."""
@@ -336,59 +360,67 @@ class HindsightLoss(nn.Module):
             value: V.
             blend: λ.
         """
-        on, found = policy
-        m, choices, k = len(on), on.shape[1], self.view.width
+        (on, found), m, choices = policy, len(policy[0]), len(self.clocks)
         # [B], [T + 2, B] and [T + 1, B]: the free choices are for the first T + 1 moves, the last one is the forced
         # step.
         start, moves = own[0], cells[1 : choices + 2]
         end = moves[:-1]
-        located_in, there = start // self._classes, end // self._classes
-        # clocks [T + 1, 1] broadcasts over paths. With M = K = 4 and T = 1: located in 3, n = 1 is row 7, and the
-        # target moving to 2 makes entry 7 * 4 + 2 = 30.
-        row = start * choices + self.clocks
-        entry = row * k + self.view.index(located_in, there)
-        # Where the target has left the grid or the view, `entry` is some other sensor's.
-        seen = (
-            end < m
-            if self._window is None
-            else self.view.contains(located_in.expand_as(end), there)
-        )
+        row, entry, seen = self._places(start, end)
         # [T + 1, B], the probability of a report; 0 or 1 with sensors that never miss.
         reports, inside = gather(found, entry) * seen.float(), moves < m
         # Set costs are computed once per (x, n) and looked up by the paths, however many there are.
         prices = torch.cat([self._set_cost(on[rows], rows) for rows in self.slices()])
-        spent, discount = gather(prices, row), self.discount
-        located = gather(pad(value[:, 0], (0, 1)), own[1:])
-        if replay:
-            terms = {"safe_cost": self.safe_cost, "discount": discount}
-            located = replay.worth(cells, own, prices, value[:, 0], **terms)
-        terms = {"reward": 1.0, "safe_cost": self.safe_cost, "discount": discount}
-        returns = chain_returns(
-            reports, inside, spent, located, repeated=self._repeated(moves[-1], value), **terms
-        )
+        spent = gather(prices, row)
+        located = self._located(replay, cells, own, prices, value[:, 0])
+        returns = self._returns((reports, inside, spent, located), moves[-1], value)
         # advantage is [T + 1, M + 1]: entry (n, y) is n (M + 1) + y.
         clocked = gather(advantage, self.clocks * (m + 1) + end)
         # V(y) - G_{n+1}: located at y now, against the plan's return on the rest of this very path. The target's true
         # cell is known because it was sensed, not from the simulator.
-        gain = sensing_gain(clocked, located[:-1] - returns[1:], discount=discount, blend=blend)
-        # Clock n is reached if no earlier set of the plan reported; other rows are not states of this policy. The move
-        # has to stay in the grid, too: an exit step earns and costs nothing.
-        alive = inside[:-1].float()
-        for n in range(1, choices):
-            alive[n] *= alive[n - 1] * (1.0 - reports[n - 1])
-        visits = torch.bincount(start, minlength=m)
+        after = located[:-1] - returns[1:]
+        gain = sensing_gain(clocked, after, discount=self.discount, blend=blend)
+        alive = _alive(inside, reports)
         gain = gain * (alive if self._window is None else alive * seen)
-        totals = [scatter_add(returns[0], start, m)]
+        firsts = [returns[0]]
         if self._safe_detection is not None:
             # No set is before it, so that it is the first step of a path.
-            repeated = self._repeated(moves[0], value)
-            forced = chain_returns(
-                reports[:0], inside[:1], spent[:0], located[:1], repeated=repeated, **terms
-            )
-            totals.append(scatter_add(forced[0], start, m))
-        # Cells without a path get the target 0, and with `visits` 0 no weight in the critic's loss.
-        target = torch.stack(totals, dim=1) / visits.clamp(min=1).unsqueeze(-1)
+            steps = (reports[:0], inside[:1], spent[:0], located[:1])
+            firsts.append(self._returns(steps, moves[0], value)[0])
+        # Cells without a path get the target 0, and with no visits no weight in the critic's loss.
+        totals = torch.stack([scatter_add(first, start, m) for first in firsts], dim=1)
+        target = totals / torch.bincount(start, minlength=m).clamp(min=1).unsqueeze(-1)
         return _Replayed(row, entry, alive, gain, target)
+
+    def _places(self, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """`[T+1, B]` each: row and entry as in `_Replayed`, and whether a sensor of the entry may report."""
+        located_in, there = start // self._classes, end // self._classes
+        # clocks [T + 1, 1] broadcasts over paths. With M = K = 4 and T = 1: located in 3, n = 1 is row 7, and the
+        # target moving to 2 makes entry 7 * 4 + 2 = 30.
+        row = start * len(self.clocks) + self.clocks
+        entry = row * self.view.width + self.view.index(located_in, there)
+        # Where the target has left the grid or the view, `entry` is some other sensor's.
+        if self._window is None:
+            return row, entry, end < self._keys.num_keys
+        return row, entry, self.view.contains(located_in.expand_as(end), there)
+
+    def _located(
+        self, replay: Replay | None, cells: Tensor, own: Tensor, prices: Tensor, value: Tensor
+    ) -> Tensor:
+        """`[T+2, B]`, the value of a detection at each step."""
+        if replay is None:
+            return gather(pad(value, (0, 1)), own[1:])
+        terms = {"safe_cost": self.safe_cost, "discount": self.discount}
+        return replay.worth(cells, own, prices, value, **terms)
+
+    def _returns(self, steps: tuple[Tensor, ...], end: Tensor, value: Tensor) -> Tensor:
+        """The returns of chains (`chain_returns`) that end with the safe action, the target then in `end` `[B]`."""
+        return chain_returns(
+            *steps,
+            reward=1.0,
+            safe_cost=self.safe_cost,
+            discount=self.discount,
+            repeated=self._repeated(end, value),
+        )
 
     def _repeated(self, end: Tensor, value: Tensor) -> tuple[Tensor, Tensor] | None:
         """`[B]` each, p_s of the cells `end`, and L, the value there if the safe action misses; or None."""
@@ -440,5 +472,18 @@ def _in_view(task: Task, radius: int, device: torch.device) -> Window:
     return Window(task, min(radius, task.numbered), device)
 
 
-def _squared_error(values: Tensor, targets: Tensor, visits: Tensor) -> Tensor:
-    return (visits.unsqueeze(-1) * (values - targets).square()).sum()
+def _alive(inside: Tensor, reports: Tensor) -> Tensor:
+    """`alive` of `_Replayed`."""
+    # Clock n is reached if no earlier set of the plan reported; other rows are not states of this policy. The move has
+    # to stay in the grid, too: an exit step earns and costs nothing.
+    alive = inside[:-1].float()
+    for n in range(1, len(alive)):
+        alive[n] *= alive[n - 1] * (1.0 - reports[n - 1])
+    return alive
+
+
+def _squared_error(values: Tensor, start: Tensor, targets: Tensor) -> Tensor:
+    """Of the values `[M, n]` of the keys that the paths start in, to the mean returns of these paths."""
+    # The squared error per cell times its number of paths is, up to a constant, the sum over paths of (V - return)^2.
+    visits = torch.bincount(start, minlength=len(values))
+    return (visits.unsqueeze(-1) * (values - targets).square()).sum() / len(start)

@@ -85,16 +85,13 @@ def choose_plan(
     order = np.argsort(scores, kind="stable")[::-1][:_SEARCHED].tolist()
     searched = [_searched(paths, plans[place]) for place in order]
     gains = [along(judged, each.plans).reward for each in searched]
-    best = int(np.argmax(gains))
-    exchanges = gains[best] > scores[order[0]]
+    exchanges = gains[best := int(np.argmax(gains))] > scores[order[0]]
     place, final = (order[best], searched[best]) if exchanges else (order[0], plans[order[0]])
     if counted is tracks:
         return final
-    # On all paths, from the plan that was chosen.
-    whole = Paths(task, tracks, discount)
+    whole = Paths(task, tracks, discount)  # from the plan that was chosen
     prior = (*priors, *(UNJUDGED for _ in others))[place] * whole.copies
-    start = final.plans.on(whole.keys)
-    planned = plan_paths(whole, prior=prior, rounds=rounds, start=start)
+    planned = plan_paths(whole, prior=prior, rounds=rounds, start=final.plans.on(whole.keys))
     return _searched(whole, planned) if exchanges else planned
 
 
