@@ -75,10 +75,10 @@ def pairs(study: Study) -> dict[tuple[int, float], str]:
         settings = runs[0].settings
         pair: Any = settings.get("kernel.support_size"), settings.get("cost.sensor")
         # T_max, border and seed of the kernel are not compared: the paper does not give them.
-        if any(settings.get(key) != value for key, value in _FIXED.items()) or pair not in [
-            *PRINTED_QMDP
-        ]:
-            continue  # a list, as prices may be a list, which has no hash
+        other = any(settings.get(key) != value for key, value in _FIXED.items())
+        # A list, as prices may be a list, which has no hash.
+        if other or settings.get("targets.count", 1) != 1 or pair not in [*PRINTED_QMDP]:
+            continue
         if pair not in found or len(study.in_world(found[pair])) < len(runs):
             found[pair] = world
     return dict(sorted(found.items()))

@@ -51,7 +51,13 @@ def read_run(place: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]]:
 
 
 def _figures(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """`FIGURES` of a summary, and `HELD_OUT` where there are validation tracks."""
+    """`FIGURES` of a summary, of all targets together, and `HELD_OUT` where there are validation tracks."""
+    if several := summary.get("several"):
+        found = {**summary, **_together(several["figures"]), **several}
+        return {name: found.get(name) for name in FIGURES} | {
+            "optimal_lower": _best_known(several),
+            "optimal_upper": several["upper"],
+        }
     validation, policy = summary.get("validation"), summary["policy"]
     solved = {f"optimal_{key}": value for key, value in (summary["optimal"] or {}).items()}
     # On recordings figures are compared, and options chosen, by the validation tracks alone.
@@ -68,6 +74,11 @@ def _references(summary: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
             for name, figures in held_out["figures"].items()
             if name != "policy"
         }
+    if several := summary.get("several"):
+        # Q_MDP and fixed sets are of a single target.
+        merged, bound = several["merged_optimum"], {"aihtr": several["upper"]}
+        apart = {"separate trackers": {"aihtr": several["apart"]}, "clocked bound": bound}
+        return ({"best known": _together(merged)} if merged else {}) | apart
     policies = {"Q_MDP": summary["qmdp"], **summary.get("references", {})}
     found = {
         name: {key: each.get(key) for key in _TRACKED.values()}
@@ -80,15 +91,31 @@ def _references(summary: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     }
 
 
+def _together(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Means of figures of several targets."""
+    return {name: each["mean"] for name, each in figures.items() if name in _TRACKED.values()}
+
+
+def _best_known(several: Mapping[str, Any]) -> float | None:
+    """The largest AIHTR known to be attained: proved, or simulated of the merged optimum."""
+    merged = (several["merged_optimum"] or {"aihtr": {"mean": None}})["aihtr"]["mean"]
+    known = [value for value in (several["lower"], merged) if value is not None]
+    return max(known, default=None)
+
+
 def read_curve(place: Path, summary: Mapping[str, Any]) -> Sequence[Sequence[float]]:
     """Points (frames, seconds, AIHTR) of the evaluations in `metrics.csv`, thinned to `MOST_POINTS`.
+
+    None of a single target's plan that is merged: its curve is not of all targets.
 
     Raises:
         UserError: the file is damaged or of another run.
     """
-    file = place / METRICS
+    file, several = place / METRICS, summary.get("several")
     check_files(place, summary, METRICS)
     with decoded(str(file), "a learning curve"):
+        if several and several["merge"] != "joint":
+            return []
         rows = csv.DictReader(io.StringIO(read_text(file, most=LARGE), newline=""))
         columns = ("frames", "seconds", "aihtr")
         # An iteration without an evaluation has an empty field.
@@ -100,12 +127,17 @@ def read_curve(place: Path, summary: Mapping[str, Any]) -> Sequence[Sequence[flo
 
 
 def read_map(place: Path, run: FinishedRun, world: str, method: str) -> Mapped | None:
-    """The policy of the run in the folder `place`, cell by cell; None on recordings, which have no motion.
+    """The policy of the run in the folder `place`, cell by cell.
+
+    None on recordings, which have no motion, and of several targets, whose sets depend on all their cells.
 
     Raises:
         UserError: a file is missing, damaged, or of another run.
     """
-    check_files(place, read_summary(place), "policy.npz", PROBLEM)
+    summary = read_summary(place)
+    check_files(place, summary, "policy.npz", PROBLEM)
+    if summary.get("several"):
+        return None
     problem = read_problem(place / PROBLEM).model
     if problem is None:
         return None

@@ -12,10 +12,16 @@ from trackmdp.reports.results import FinishedRun
 
 # Order of legends and tables; other algorithms follow.
 ORDER = ("a2c", "hindsight", "ppo", "dqn", "model_based")
-SHORT = {"kernel.support_size": "Z", "cost.sensor": "c", "grid.size": "N", "grid.t_max": "T_max"}
+SHORT = {
+    "kernel.support_size": "Z",
+    "cost.sensor": "c",
+    "grid.size": "N",
+    "grid.t_max": "T_max",
+    "targets.count": "K",
+}
 OPEN = 5e-5
 """Regret per step that no figure of four digits shows: a narrower bracket is an optimum."""
-_WORLD = ("grid.", "kernel.", "cost.", "sensor.")
+_WORLD = ("grid.", "kernel.", "cost.", "sensor.", "targets.count")
 _KNOWLEDGE = "kernel.homogeneous"
 """An option of the kernel that only the learner reads."""
 # Options of no effect on the learned policy, or of its draw.
@@ -57,6 +63,12 @@ class Study:
         return any(
             "held_out_aihtr" in run.figures for group in self.groups.values() for run in group
         )
+
+    @property
+    def several(self) -> bool:
+        """Whether some runs are of several targets."""
+        counts = (self.in_world(world)[0].settings.get("targets.count", 1) for world in self.worlds)
+        return any(count != 1 for count in counts)
 
     def references(self) -> list[str]:
         """Names of the policies and bounds that runs are compared with."""
@@ -114,6 +126,11 @@ class Study:
         earned = run.figure("aihtr") if aihtr is None else aihtr
         # Per step: worlds with different lengths of stay can be averaged.
         return (self.upper(world) - earned) / run.figure("expected_length")
+
+    def ends(self, world: str) -> tuple[float | None, float | None]:
+        """Best AIHTR known and least upper bound in a world whose optimum is not certified; else None."""
+        shown = self.best(world), self.upper(world)
+        return shown if self.bracket(world) >= OPEN else (None, None)
 
     def bracket(self, world: str) -> float:
         """Largest error per step of the regrets in a world: from the best policy known to the bound."""

@@ -32,6 +32,10 @@ def figure_cells(values: Mapping[str, float]) -> list[Cell]:
     return [(100 if each.unit == "%" else 1) * values[key] for key, each in FIGURES.items()]
 
 
+OPEN_ENDS = [Column("best AIHTR known", 3), Column("upper bound", 3)]
+"""Of worlds whose optimum is not certified, as those of several targets."""
+
+
 def interval_columns(head: str, digits: int) -> list[Column]:
     """Columns for the ends of an interval."""
     return [Column(f"{head}95 % from", digits), Column("to", digits)]
@@ -75,6 +79,8 @@ def _note(study: Study) -> str:
     note = (
         f"; regrets may be too large where the optimum is not certified: {listed}" if wide else ""
     )
+    if study.several:
+        note += "; several targets: of all together, the best known being single optima merged"
     return note + ("; on recordings, AIHTR of the validation tracks" if study.recorded else "")
 
 
@@ -100,8 +106,8 @@ def groups_table(study: Study, threshold: float | None) -> Table:
         cells = figure_cells({key: each.mean for key, each in known.items()})
         ends = [each for key in ("aihtr", "regret") for each in (known[key].low, known[key].high)]
         within = _within(study.values(world, method, "regret"), threshold)
-        rows.append([world, method, *cells, *ends, *within, len(runs)])
-    columns = [Column("world"), Column("method"), *FIGURES.values()]
+        rows.append([world, method, *cells, *study.ends(world), *ends, *within, len(runs)])
+    columns = [Column("world"), Column("method"), *FIGURES.values(), *OPEN_ENDS]
     columns += [*interval_columns("AIHTR: ", 3), *interval_columns("regret: ", 5)]
     caption = (
         "Every world and method: means over n seeds, with intervals of the AIHTR and of the regret"
@@ -116,8 +122,8 @@ def runs_table(study: Study) -> Table:
         for run in runs:
             cells = figure_cells({key: study.value(world, run, key) for key in FIGURES})
             best = study.regret(run, world) - study.bracket(world)
-            rows.append([world, method, run.seed, *cells, best, run.name])
-    columns = [Column("world"), Column("method"), Column("seed"), *FIGURES.values()]
+            rows.append([world, method, run.seed, *cells, *study.ends(world), best, run.name])
+    columns = [Column("world"), Column("method"), Column("seed"), *FIGURES.values(), *OPEN_ENDS]
     columns += [Column("regret per step to the best known", 5), Column("folder")]
     return Table("runs", f"All {len(rows)} finished runs", columns, rows)
 

@@ -90,6 +90,7 @@ class Several:
 
     Attributes:
         group: the targets.
+        merge: how single targets' plans were put together; joint for a policy that was learned of all.
         figures: of the policy.
         upper: proved: no policy has a higher AIHTR.
         solution: optima of single targets; None where they were not solved for.
@@ -97,6 +98,7 @@ class Several:
     """
 
     group: Group
+    merge: str
     figures: GroupEvaluation
     upper: float
     solution: GroupSolution | None
@@ -115,6 +117,7 @@ class Several:
         found, solution = self.figures, self.solution
         return {
             "targets": len(self.group),
+            "merge": self.merge,
             "exact": found.exact,
             "episodes": 0 if found.exact else len(found.totals),
             "expected_length": found.expected_length,
@@ -158,7 +161,7 @@ def beside(
     group = rule.group
     figures, upper = evaluate_group(rule, width=width, seed=seed), upper_bound(group)
     if not cfg.enabled:
-        return Several(group, figures, upper, None, None)
+        return Several(group, rule.name, figures, upper, None, None)
     singles = (
         tuple(
             optimal.solve(world, nodes=cfg.nodes, time_limit=cfg.time_limit)
@@ -169,7 +172,7 @@ def beside(
     )
     solution = GroupSolution(group, singles, upper, sum(each.seconds for each in singles))
     merged = evaluate_group(solution.policy, width=width, seed=seed)
-    return Several(group, figures, upper, solution, merged)
+    return Several(group, rule.name, figures, upper, solution, merged)
 
 
 def _intervals(found: GroupEvaluation) -> dict[str, Any]:
