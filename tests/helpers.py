@@ -109,7 +109,8 @@ def small_world(
 
 def limited(problem: Any, max_steps: int | None) -> Any:
     """The same problem, its episodes cut after so many steps."""
-    return replace(problem, max_steps=max_steps)
+    same = getattr(problem, "max_steps", None) == max_steps
+    return problem if same else replace(problem, max_steps=max_steps)
 
 
 def random_kernel(

@@ -75,6 +75,14 @@ def test_optimum_of_the_papers_pairs_is_proved(pair: tuple[int, float], budget: 
     assert found.table.most_on == min(budget, found.table.most_on)
 
 
+def test_prices_near_the_least_of_all_numbers_are_prices() -> None:
+    least, free = (
+        solve(tm.make_world("random_walk", size=3, cost=cost, budget=1, safe_cost=1.0)).lower
+        for cost in (5e-324, 0.0)
+    )
+    assert least == pytest.approx(free)
+
+
 def test_rules_keep_to_the_budget_by_the_largest_gains() -> None:
     world = paper_world(5, 0.16, 1, 4).but(budget=2)
     free = world.but(budget=None)

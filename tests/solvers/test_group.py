@@ -15,6 +15,7 @@ from tests.solvers.worlds import random_tiny_world
 from trackmdp.app.cli import main
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
+from trackmdp.solvers import group_value
 from trackmdp.solvers.group_bounds import equal_shares, upper_bound
 from trackmdp.solvers.group_chain import explored
 from trackmdp.solvers.group_value import evaluate_group
@@ -194,8 +195,25 @@ def test_words_without_effect_are_refused(
     assert refusal in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("width", [0, -1, float("nan"), float("inf"), "x", None])
+def test_a_width_that_no_interval_has_is_refused(width: Any) -> None:
+    with pytest.raises(UserError, match=f"width={width}: expected a number > 0"):
+        evaluate(Group([tiny(0)] * 2), "none", width=width)
+
+
+def test_a_width_that_is_never_reached_ends_at_the_most_episodes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(group_value, "_MOST", 100)
+    world = tm.make_world("random_walk", size=4, exit_probability=0.2)
+    assert len(evaluate(Group([world] * 3), "qmdp", width=5e-324).totals) == 100
+
+
 def test_other_targets_and_policies_are_refused() -> None:
     world = tiny(0)
+    for many in (None, 5, world, [], [None], [world] * 1001):
+        with pytest.raises(UserError, match="Group: expected a list of 1 to 1,000 times a World"):
+            Group(many)  # type: ignore[arg-type]
     with pytest.raises(UserError, match="target 1 has another grid, price or limit"):
         Group([world, world.but(t_max=1)])
     with pytest.raises(UserError, match=r"grid.max_steps=5, expected none with several targets"):

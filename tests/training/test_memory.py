@@ -16,6 +16,7 @@ from trackmdp.app.cli import main
 from trackmdp.config import DqnConfig
 from trackmdp.errors import UserError
 from trackmdp.training.devices import available_bytes, check_memory, needs
+from trackmdp.world.group import Group
 
 CPU = torch.device("cpu")
 
@@ -55,6 +56,18 @@ def test_the_replay_buffer_takes_what_was_estimated(
     held = learner.state_dict()["buffer"]
     del held["_rng"]
     assert needs(cfg, world.task)["algo.buffer_size"] == nbytes(held)
+
+
+def test_the_replay_buffer_of_several_targets_takes_what_was_estimated() -> None:
+    group = Group([small_world()] * 3)
+    words = ("targets.count=3", "algo=dqn", "algo.buffer_size=3000", "algo.updates=1")
+    cfg = train_config(*words, "algo.batch_size=64", "collector.frames_per_batch=256")
+    assert isinstance(cfg.algo, DqnConfig)
+    learner = DQN(group.task, cfg.algo, iterations=1, seed=0, device=CPU, targets=group.targets)
+    learner.step(collect(group, learner.policy, 16, 4))
+    held = learner.state_dict()["buffer"]
+    del held["_rng"]
+    assert needs(cfg, group.task)["algo.buffer_size"] == nbytes(held)
 
 
 def test_a_buffer_that_cannot_fit_is_refused_before_anything_is_written(
@@ -99,6 +112,21 @@ def test_batches_that_cannot_fit_are_named() -> None:
         UserError, match=r"^collector.frames_per_batch=2560000000: needs about [\d,.]+ GiB, "
     ):
         check_memory(cfg, small_world().task, CPU)
+
+
+def test_targets_that_are_learned_together_and_cannot_fit_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["targets.count=1000", "collector.total_frames=2560000"]
+    joint = [*words, "algo=a2c", "collector.frames_per_batch=2560000"]
+    assert main(["train", *joint, f"hydra.run.dir={tmp_path / 'run'}"]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("trackmdp train: targets.count=1000: needs about 14,8")
+    assert not (tmp_path / "run").exists()
+    # A single target's plan takes what it takes, however many targets it is merged for.
+    single, one = (train_config("algo=hindsight", *more) for more in (words[:1], []))
+    task = small_world().task
+    assert needs(single, task) == needs(one, task)
 
 
 def test_a_run_says_what_it_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

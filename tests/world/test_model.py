@@ -54,6 +54,12 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
         World(np.eye(9), 2, cost=np.zeros(4), safe_cost=1.0, t_max=0)
 
 
+@pytest.mark.parametrize(("name", "most"), [("window", "1,024"), ("t_max", "10,000")])
+def test_a_history_of_actions_that_fits_nowhere_is_refused(name: str, most: str) -> None:
+    with pytest.raises(UserError, match=f"{name}=1000000000: expected an integer from 0 to {most}"):
+        Task(2, cost=0.1, **{"t_max": 0, name: 10**9})  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     "made",
     [

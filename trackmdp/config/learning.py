@@ -23,6 +23,9 @@ MOST_FRAMES = 10**12
 DEVICE = r"auto|cpu|cuda(:\d+)?"
 """Names of devices."""
 
+_PASSES = 6
+"""Arrays of hidden units that are held while networks learn of several targets; measured with 20 and 60 of them."""
+
 LEARNING_RATE, ENTROPY = "step size of the optimiser", "weight of the entropy bonus"
 
 
@@ -98,8 +101,16 @@ class NetworkConfig(EveryTaskConfig):
     reward_scale: float = option("factor on rewards while learning", gt=0)
 
     def needs(self, task: Sizes, root: Any) -> dict[str, int]:
-        """Two networks and their optimiser."""
-        return {"algo.hidden": networks(task, self.hidden)}
+        """Two networks and their optimiser; their hidden units for each target of a batch."""
+        found, targets = {"algo.hidden": networks(task, self.hidden)}, together(root)
+        if targets > 1:
+            rows = targets * self.learned_at_once(root)
+            found["targets.count"] = _PASSES * rows * self.hidden * BYTES["float32"]
+        return found
+
+    def learned_at_once(self, root: Any) -> int:
+        """Frames that go through the networks together."""
+        return int(root.collector.frames_per_batch)
 
 
 class ActorCriticConfig(NetworkConfig):
@@ -175,13 +186,16 @@ class DqnConfig(NetworkConfig):
         """The replay buffer with two states a transition; the networks."""
         # State and next state, the action's K bits as bools, two float32 and one flag (reward, discount,
         # terminated), an index.
-        transition = (
-            2 * state_bytes(task) + task.num_sensors + 2 * BYTES["float32"] + 1 + BYTES["int64"]
-        )
+        states = 2 * state_bytes(task, together(root))
+        transition = states + task.num_sensors + 2 * BYTES["float32"] + 1 + BYTES["int64"]
         priority = BYTES["float64"] if self.prioritized.enabled else 0
         return super().needs(task, root) | {
             "algo.buffer_size": self.buffer_size * (transition + priority)
         }
+
+    def learned_at_once(self, root: Any) -> int:
+        """Frames that go through the networks together."""
+        return self.batch_size
 
 
 class CollectorConfig(ChoiceConfig):
@@ -218,7 +232,8 @@ class CollectorConfig(ChoiceConfig):
     def needs(self, task: Sizes, root: Any) -> dict[str, int]:
         """Two batches: one is collected while the other is handed over."""
         number = BYTES["float32"]
-        frame = 2 * (state_bytes(task) + 3) + task.num_sensors + number * (task.num_sensors + 2)
+        state = state_bytes(task, together(root))
+        frame = 2 * (state + 3) + task.num_sensors + number * (task.num_sensors + 2)
         return {"collector.frames_per_batch": 2 * self.frames_per_batch * frame}
 
 
@@ -280,9 +295,18 @@ def check_classes(key: str, algo: AlgoConfig) -> None:
         raise refuse(key, given, expected)
 
 
-def state_bytes(task: Sizes) -> int:
-    """Bytes of one observation: located cell, misses, the key where there is one, the actions since the detection."""
-    return (2 + task.keyed) * BYTES["int64"] + task.num_choices * task.num_sensors
+def together(root: Any) -> int:
+    """Targets that a run learns of together."""
+    return int(root.targets.count) if root.algo.joint else 1
+
+
+def state_bytes(task: Sizes, targets: int = 1) -> int:
+    """Bytes of one observation: located cell, misses, the key where there is one, the actions since the detection.
+
+    Of several targets cell and misses are those of each, and whether it is in the grid is observed too.
+    """
+    each = (2 + task.keyed) * BYTES["int64"] + (targets > 1)
+    return targets * each + task.num_choices * task.num_sensors
 
 
 def networks(task: Sizes, hidden: int | None) -> int:

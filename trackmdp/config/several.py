@@ -6,6 +6,9 @@ from typing import Any
 
 from trackmdp.config.options import NodeConfig, option, refuse
 
+MOST_TARGETS = 1_000
+"""Targets in one grid: of more, each step and each bound would take minutes."""
+
 
 class TargetsConfig(NodeConfig):
     """Targets that are in the grid at the same time: labelled, independent, alike in their motion."""
@@ -14,7 +17,7 @@ class TargetsConfig(NodeConfig):
         "K; they share the sensors, which are paid once while any of them is in the grid",
         unit="targets",
         ge=1,
-        le=1000,
+        le=MOST_TARGETS,
     )
 
     def check(self, key: str, root: Any) -> None:

@@ -219,5 +219,6 @@ class Own(Decisions):
         gained = self.gained(gain)
         far = np.full_like(gained, np.inf)
         # Free sensors come last: no price would make them nearly worth leaving out.
-        away = np.divide(np.abs(gained - price), price, out=far, where=price > 0)
+        with np.errstate(over="ignore"):  # a price near the least of all numbers: far away
+            away = np.divide(np.abs(gained - price), price, out=far, where=price > 0)
         return (away if self.allowed is None else np.where(self.allowed, away, np.inf))[:, 0]

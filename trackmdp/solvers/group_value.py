@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from trackmdp.errors import UserError
 from trackmdp.seeding import derive
 from trackmdp.solvers.group_chain import joint_chain
 from trackmdp.solvers.group_figures import GroupEvaluation
@@ -35,7 +36,12 @@ def evaluate_group(
         width: half of the 95 % interval of the reward per step that is wanted.
         seed: of the targets; the same for every policy.
         episodes: simulate so many, in place of `width`, and never the chain.
+
+    Raises:
+        UserError: `width` is no number > 0.
     """
+    if not isinstance(width, int | float) or not 0 < width < math.inf:
+        raise UserError(f"width={width}: expected a number > 0")
     group = rule.group
     exact_steps = group.expected_steps, (group.target_steps, known_mean(rule))
     if episodes is None and (exact := joint_chain(rule)) is not None:
@@ -51,7 +57,7 @@ def evaluate_group(
         if half <= width:
             break
         # A little more than the law of the square root asks for, so that few rounds are needed.
-        wanted = min(math.ceil(count * (1.05 * half / width) ** 2), 8 * count, _MOST)
+        wanted = min(math.ceil(count * min(1.05 * half / width, 3.0) ** 2), 8 * count, _MOST)
         parts.append(simulated(rule, max(wanted - count, 1), seed, f"more {len(parts)}"))
         found = GroupEvaluation(np.concatenate(parts), False, *exact_steps)
     return found

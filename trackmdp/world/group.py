@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from trackmdp.config.several import MOST_TARGETS
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, grid_words
 from trackmdp.world.model import Array, Task, World
@@ -36,9 +37,10 @@ class Group(Carded):
     worlds: Sequence[World]
 
     def __post_init__(self) -> None:
-        worlds = tuple(self.worlds)
+        many = isinstance(self.worlds, Sequence) and 1 <= len(self.worlds) <= MOST_TARGETS
+        worlds = tuple(self.worlds) if many else ()
         if not worlds or not all(isinstance(world, World) for world in worlds):
-            raise UserError("Group: expected one World or more")
+            raise UserError(f"Group: expected a list of 1 to {MOST_TARGETS:,} times a World")
         for number, world in enumerate(worlds):
             if name := _of_one_target(world):
                 raise UserError(f"targets: {name}, expected none with several targets")

@@ -61,6 +61,16 @@ NEVER = 1e30
 """Price of a sensor that does not exist, for planners; finite, so that times no mass it is 0."""
 
 _NULLABLE = ("max_steps", "window", "budget")
+_RANGES = {
+    # A history of t_max + 1 actions, or of (2W+1)² sensors, of more would not fit, or be worked on for hours.
+    "t_max": (0, 10_000),
+    "max_steps": (1, math.inf),
+    "window": (0, 1024),
+    "budget": (0, math.inf),
+    "clip": (1, math.inf),
+    "revealed": (1, math.inf),
+}
+"""Whole numbers of a task: the least and the largest."""
 _GIVEN: Any = 1.0
 _SUM: Any = None
 """Defaults of a task that its constructor makes arrays and a price of."""
@@ -139,18 +149,11 @@ class Task(Carded):
         checked["reward"] = _price("reward", self.reward)
         for name in ("detection", "safe_detection"):
             checked[name] = one_each(name, getattr(self, name), size, "cell", PROBABILITIES)
-        for name, lowest in (
-            ("t_max", 0),
-            ("max_steps", 1),
-            ("window", 0),
-            ("budget", 0),
-            ("clip", 1),
-            ("revealed", 1),
-        ):
+        for name, (lowest, most) in _RANGES.items():
             value = getattr(self, name)
-            checked[name] = (
-                None if value is None and name in _NULLABLE else _at_least(lowest, name, value)
-            )
+            if value is not None or name not in _NULLABLE:
+                value = _whole(name, value, lowest, most)
+            checked[name] = value
         if checked["budget"] is not None and footprints is not None:
             raise UserError(
                 f"budget={self.budget}: expected None with sensors that have footprints"
@@ -394,7 +397,7 @@ class World(Task):
         reveals: bool = False,
         **of_task: Unpack[TaskOptions],
     ) -> None:
-        modes = _at_least(1, "modes", modes)
+        modes = _whole("modes", modes, 1)
         known = modes if reveals else of_task.get("revealed", 1)
         if known not in (1, modes):
             raise UserError(f"revealed={known}: expected 1 or {modes}, the modes of the target")
@@ -546,7 +549,8 @@ def _price(name: str, value: float, most: float = LARGEST_PRICE) -> float:
     return float(value)
 
 
-def _at_least(lowest: int, name: str, value: int) -> int:
-    if not isinstance(value, (int, np.integer)) or value < lowest:
-        raise UserError(f"{name}={value}: expected an integer >= {lowest}")
+def _whole(name: str, value: int, lowest: int, most: float = math.inf) -> int:
+    if not isinstance(value, (int, np.integer)) or not lowest <= value <= most:
+        expected = f">= {lowest}" if most == math.inf else f"from {lowest} to {most:,}"
+        raise UserError(f"{name}={value}: expected an integer {expected}")
     return int(value)
