@@ -2,7 +2,8 @@
 
 Where the next move depends on the cell alone, the estimate is a kernel of pooled moves, planned on by the solvers.
 Where it may not, plans are made on whole sensed paths; a quarter of them, not used for learning,
-chooses between these plans and the plan of the pooled moves. Steps are spent with all sensors on, or on sets
+chooses between these plans, the plan of the pooled moves and, on small grids, the plan for a target whose next move
+depends on its last one. Steps are spent with all sensors on, or on sets
 planned for a kernel drawn from the posterior (posterior sampling, Thompson 1933), which costs far less and leaves moves
 to be inferred from misses.
 """
@@ -24,6 +25,7 @@ from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.estimates.path_counts import plan_paths
 from trackmdp.algos.estimates.path_gains import Paths
 from trackmdp.algos.estimates.path_plans import UNJUDGED, choose_plan
+from trackmdp.algos.estimates.second_order import displacements, second_order
 from trackmdp.algos.estimates.shrinkage import believed_world, least_worth_planning
 from trackmdp.algos.observed import SensedPaths, observed_paths
 from trackmdp.config.counting import ModelBasedConfig
@@ -32,7 +34,7 @@ from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.saved import packed, unpacked_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
-from trackmdp.solvers import exchange
+from trackmdp.solvers import exchange, hidden
 from trackmdp.solvers.linear import DIRECT_CELLS
 from trackmdp.solvers.value import evaluate
 from trackmdp.world.model import Task, World
@@ -48,6 +50,8 @@ _SAMPLES = 8
 """Kernels drawn for the uncertainty reported."""
 _MOST_CELLS = 1_600
 """Cells up to which plans of pooled moves are tried beside those of paths."""
+_MOST_STATES = 500
+"""Pairs of a cell and a move up to which plans for moves that depend on the last one are tried as well."""
 
 
 class ModelBased:
@@ -144,6 +148,9 @@ class ModelBased:
         task, cfg, tracks = self.task, self.cfg, self._paths.tracks()
         if last and cfg.prior is None:
             others = [self._pooled] if self._compares else []
+            states = task.num_cells * len(displacements(task, tracks))
+            if self._compares and task.num_cells < states <= _MOST_STATES:
+                others.append(self._after_moves)
             found = choose_plan(
                 task,
                 tracks,
@@ -163,10 +170,18 @@ class ModelBased:
 
     def _pooled(self, tracks: Tracks) -> PolicyTable:
         """The plan for the moves of `tracks`, as if the next one depended on the cell alone."""
+        return lifted(self.task, exchange.solve(self._world(self._of_moves(tracks)), 0))
+
+    def _after_moves(self, tracks: Tracks) -> PolicyTable:
+        """The plan for a target whose next move depends on the cell and on its last move."""
+        world = second_order(self.task, tracks, self._of_moves(tracks), self._least)
+        return hidden.best_found(world)
+
+    def _of_moves(self, tracks: Tracks) -> sparse.csr_array:
+        """`[M, M + 1]`, the kernel of the moves of `tracks`."""
         estimate = self._new_estimate()
         estimate.add_moves(*tracks.steps(self.task.num_cells))
-        world = self._world(estimate.believed(self._least))
-        return lifted(self.task, exchange.solve(world, 0))
+        return estimate.believed(self._least)
 
     def _world(self, kernel: sparse.csr_array) -> World:
         """The task with a `[M, M + 1]` kernel."""

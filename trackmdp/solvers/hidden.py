@@ -35,17 +35,22 @@ def solve(world: World, *, start: PolicyTable | None = None) -> Solution:
         start: a deterministic policy of the same keys that the one found is no worse than.
     """
     began = time.monotonic()
-    renewal = Renewal(world, world.motion)
-    policies = [exchanged(renewal, each) for each in _starts(renewal, world, start)]
-    best = max(policies, key=lambda policy: policy.aihtr)
-    others = (policy.sets for policy in policies if policy is not best)
-    table = renewal.table(best_of(renewal, best, others).sets)
+    table = best_found(world, start=start)
     evaluation = evaluate(world, table)
     bound = np.maximum(optimal.solve(revealing(world)).bound, evaluation.value)
     gap = float((bound - evaluation.value).mean())
     certified = gap <= 1e-6 * max(1.0, abs(evaluation.aihtr))
     seconds = time.monotonic() - began
     return Solution(table, evaluation, bound, certified, seconds, nodes=0, interrupted=False)
+
+
+def best_found(world: World, *, start: PolicyTable | None = None) -> PolicyTable:
+    """The policy of `solve`, without its bound."""
+    renewal = Renewal(world, world.motion)
+    policies = [exchanged(renewal, each) for each in _starts(renewal, world, start)]
+    best = max(policies, key=lambda policy: policy.aihtr)
+    others = (policy.sets for policy in policies if policy is not best)
+    return renewal.table(best_of(renewal, best, others).sets)
 
 
 def _starts(renewal: Renewal, world: World, start: PolicyTable | None) -> Iterator[Found]:
