@@ -105,6 +105,16 @@ def test_stone_soup() -> None:
 
 
 @pytest.mark.slow
+def test_stone_soup_of_several_targets() -> None:
+    """With no sensors three targets are far off, also with a safe action in every third step."""
+    pytest.importorskip("stonesoup", reason="needs the extra: pip install 'trackmdp[stonesoup]'")
+    off, merged = (numbers(line) for line in example("stone_soup/several"))
+    assert off[0] == 0 < merged[0] < 25
+    assert off[1] < merged[1] <= 1
+    assert off[2] > 3 * merged[2] > 0
+
+
+@pytest.mark.slow
 def test_own_tracks() -> None:
     loaded, *rows = example("own_tracks")
     assert loaded.startswith("17,970 reports read, 719 targets")

@@ -10,15 +10,18 @@ import pytest
 import trackmdp as tm
 from tests.helpers import small_world
 from tests.tracks import by_hand
+from trackmdp.episodes.group_episode import GroupEpisode
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
+from trackmdp.world.group import Group
 
 pytest.importorskip("stonesoup", reason="needs the extra: pip install 'trackmdp[stonesoup]'")
 
 from stonesoup.types.groundtruth import GroundTruthPath, GroundTruthState
 from stonesoup.types.state import State
 from stonesoup.types.track import Track
-from trackmdp_stone_soup.following import follow, gospa
+from stonesoup.types.update import Update
+from trackmdp_stone_soup.following import follow, gospa, seen_of
 from trackmdp_stone_soup.places import Places, paths_of, tracks_of
 from trackmdp_stone_soup.sensors import CellSensor, PolicySensorManager
 
@@ -114,6 +117,43 @@ def test_gospa_by_hand() -> None:
     assert found["distance"] == pytest.approx((0 + 100 + 300) / 3)
     assert found["localisation"] == pytest.approx(100**2 / 3)
     assert found["missed"] == found["false"] == pytest.approx(300**2 / 2 / 3)
+
+
+def test_gospa_of_two_targets_by_hand() -> None:
+    """Off by 100 m in step 1; located in step 2, in which the other one has left; cutoff 150 m, p = 2.
+
+    The first target walks 0 > 1 > 2, missed and then located; the second stays in 8, located, and leaves.
+    """
+    episode = GroupEpisode(
+        *(0, 0, 0),
+        start=np.array([0, 8]),
+        misses=np.array([[0, 0], [1, 0]]),
+        action=np.zeros((2, 9), dtype=bool),
+        target=np.array([[1, 8], [2, 9]]),
+        located=np.array([[False, True], [True, False]]),
+        reward=np.zeros(2),
+        terminated=False,
+    )
+    tracks = seen_of(episode, PLACES)
+    assert [[PLACES.cell(state) for state in track] for track in tracks] == [[0, 0, 2], [8, 8]]
+    assert [isinstance(state, Update) for state in tracks[0]] == [True, False, True]
+    found = gospa(tracks, paths_of(episode.singles(), PLACES), c=150.0)
+    assert found["distance"] == pytest.approx((0 + 100 + 0) / 3)
+    assert found["missed"] == found["false"] == 0
+    # One that goes on after its target has left: c²/2 as a false one, and c²/2 a step for the one that none follows.
+    longer = Track([*tracks[1], State(PLACES.centre(8), timestamp=PLACES.time(2))])
+    wrong = gospa([longer], paths_of(episode.singles(), PLACES), c=150.0)
+    assert wrong["missed"] == pytest.approx(150**2 / 2 * (1 + 1 + 1) / 3)
+    assert wrong["false"] == pytest.approx(150**2 / 2 / 3)
+
+
+def test_tracks_of_simulated_groups_end_with_their_targets() -> None:
+    """All sensors on: every track is its target's path, and GOSPA is 0."""
+    group = Group([WORLD, WORLD, WORLD])
+    for episode in tm.simulate(group, Policy.all_on(WORLD), 5, seed=3, merge="union"):
+        tracks, paths = seen_of(episode, PLACES), paths_of(episode.singles(), PLACES)
+        assert [len(each) for each in tracks] == [len(each) for each in paths]
+        assert gospa(tracks, paths)["distance"] == 0.0
 
 
 def test_a_policy_that_draws_is_refused() -> None:

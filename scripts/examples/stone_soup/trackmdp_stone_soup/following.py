@@ -9,15 +9,16 @@ import numpy as np
 import numpy.typing as npt
 from stonesoup.metricgenerator.manager import MultiManager
 from stonesoup.metricgenerator.ospametric import GOSPAMetric
-from stonesoup.types.detection import TrueDetection
+from stonesoup.types.detection import Detection, TrueDetection
 from stonesoup.types.groundtruth import GroundTruthPath, GroundTruthState
 from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.prediction import StatePrediction
 from stonesoup.types.track import Track
 from stonesoup.types.update import StateUpdate
 
+from trackmdp.episodes.episode import Recording, last_cells
 from trackmdp.world.model import BoolArray
-from trackmdp_stone_soup.places import ends_with_exit
+from trackmdp_stone_soup.places import Places, ends_with_exit
 from trackmdp_stone_soup.sensors import PolicySensorManager
 
 
@@ -87,7 +88,31 @@ def _reports(manager: PolicySensorManager, truth: GroundTruthState) -> list[True
     return [report for sensor in manager.sensors for report in sensor.measure({truth})]
 
 
-def _update(detection: TrueDetection) -> StateUpdate:
+def seen_of(episode: Recording, places: Places) -> list[Track]:
+    """What was known of each target of an episode, as a track that ends when it leaves the grid.
+
+    A track has one state a step: an update where its target was located, else its last known place.
+    """
+    tracks = []
+    for each in episode.singles():
+        inside = each.target < places.num_cells
+        known = zip(
+            last_cells(each.start, each.target, each.located)[1:], each.located, strict=True
+        )
+        states = [_report(places, each.start, 0)]
+        for t, (cell, located) in enumerate(known, start=1):
+            if inside[t - 1]:
+                point = StatePrediction(places.centre(cell), timestamp=places.time(t))
+                states.append(_report(places, cell, t) if located else point)
+        tracks.append(Track(states))
+    return tracks
+
+
+def _report(places: Places, cell: int, step: int) -> StateUpdate:
+    return _update(Detection(places.centre(cell), timestamp=places.time(step)))
+
+
+def _update(detection: Detection) -> StateUpdate:
     # A report is certain: the prediction before it does not matter.
     place, time = detection.state_vector, detection.timestamp
     hypothesis = SingleHypothesis(StatePrediction(place, timestamp=time), detection)
