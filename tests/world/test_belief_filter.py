@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import tracemalloc
 
 import numpy as np
 import torch
@@ -11,8 +12,10 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from tests.helpers import random_kernel, small_world
-from trackmdp.episodes.belief_filter import BeliefFilter
+from trackmdp.episodes.belief_filter import BeliefFilter, beliefs
+from trackmdp.episodes.simulate import simulate
 from trackmdp.world.env import TrackEnv
+from trackmdp.world.make import make_world
 
 KERNEL = sparse.csr_array(
     [[0.2, 0.3, 0.4, 0.0], [0.5, 0.0, 0.0, 0.25], [0.0, 0.0, 0.5, 0.5], [0.1, 0.1, 0.1, 0.1]]
@@ -92,3 +95,14 @@ def test_it_says_where_the_environments_targets_are() -> None:
     assert counts.sum() > 20_000
     p = rows[0].numpy()
     assert (abs(counts - counts.sum() * p) <= 5 * np.sqrt(counts.sum() * p * (1 - p))).all()
+
+
+def test_a_long_episode_takes_no_probabilities_of_all_its_steps_at_once() -> None:
+    world = make_world("random_walk", size=40, detection=0.8, exit_probability=0.003)
+    (episode,) = simulate(world, "none", 1, seed=2)
+    tracemalloc.start()
+    beliefs(world, [episode])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(episode) > 100
+    assert peak < 4 * len(episode) * world.num_cells
