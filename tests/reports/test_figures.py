@@ -14,6 +14,7 @@ import pytest
 from matplotlib.figure import Figure as Canvas
 
 from tests.reports.sweeps import write_sweep
+from tests.reports.test_grouping import run
 from trackmdp.app.cli import main
 from trackmdp.reports import figures
 from trackmdp.reports.figures import Line, Panel
@@ -22,6 +23,7 @@ from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.results import Results
 from trackmdp.reports.style import LOOKS, PALETTE, REFERENCES, Figure, draw_figure, legend, looks_of
 from trackmdp.reports.tables import Column, Table
+from trackmdp.reports.tradeoffs import swept_figure
 from trackmdp.statistics import MeanInterval
 
 EMPTY = Table("f", "caption", [Column("x")], [[1]])
@@ -68,6 +70,34 @@ def test_the_numbers_of_a_figure_are_those_of_the_runs(grouped: Study, panel: Pa
     assert rows["printed bound"][2] == runs[0].references["printed bound"]["aihtr"]
     assert rows["all on"][2] == runs[0].references["all on"]["aihtr"]
     assert "n = 3 seeds" in figure.title
+
+
+def test_learned_policies_lie_over_the_frontier_of_the_solved_ones() -> None:
+    """At prices 1 to 4: the second lies below the line from the first to the third, the fourth gains nothing."""
+    solved = [(1.0, 4.0, 0.9), (2.0, 3.0, 0.7), (3.0, 1.0, 0.5), (4.0, 5.0, 0.8)]
+    runs = []
+    for price, sensors, accuracy in solved:
+        best = {"best known": {"aihtr": 1.0, "sensors_per_step": sensors, "accuracy": accuracy}}
+        for seed in range(2):
+            options = {"cost.sensor": price, "seed": seed}
+            figures_of_run = {
+                "aihtr": 0.5,
+                "expected_length": 2.0,
+                "sensors_per_step": sensors + 0.5 * seed,
+                "accuracy": accuracy - 0.1 * seed,
+            }
+            made = run(f"{price}-{seed}", "algo=a2c", options=options, **figures_of_run)
+            runs.append(replace(made, references=best))
+    found = study(runs)
+    (priced,) = figures.panels(found)
+    figure = swept_figure(found, priced)
+    assert figure
+    rows = {(row[0], row[1]): row[2:] for row in figure.table.rows}
+    line = {price: rows["best known", price][2] for price, *_ in solved}
+    assert line == {1.0: True, 2.0: False, 3.0: True, 4.0: False}
+    for price, sensors, accuracy in solved:
+        assert rows["best known", price][:2] == [sensors, accuracy]
+        assert rows["a2c", price][:2] == pytest.approx([sensors + 0.25, accuracy - 0.05])
 
 
 def test_exact_lines_stand_at_the_true_price_and_learned_ones_beside_it(

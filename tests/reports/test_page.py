@@ -189,7 +189,7 @@ def test_runs_on_recordings_have_no_regret_and_held_out_figures_under_their_name
     assert not found.maps
     made = build(found)
     drawn = [figure.table.name for figure in made.figures]
-    assert drawn == ["aihtr-z-5", "accuracy-z-5", "sensors-per-step-z-5"]
+    assert drawn == ["aihtr-z-5", "accuracy-z-5", "sensors-per-step-z-5", "frontier-z-5"]
     table = next(table for table in made.tables if table.name == "outcome")
     heads = [column.label for column in table.columns]
     learned, reference = table.rows

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from importlib.resources import files
 from typing import Any, TypeAlias
 
-from trackmdp.reports import figures, idea, maps, summaries
+from trackmdp.reports import figures, idea, maps, summaries, tradeoffs
 from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.results import Mapped, Results
 from trackmdp.reports.style import Figure, Say
@@ -170,7 +170,7 @@ def _prices(grouped: Study, threshold: float | None) -> list[Part]:
         drawn = (
             figures.against_price(grouped, panel, key, threshold) for key in figures.QUANTITIES
         )
-        parts.append([*filter(None, drawn)])
+        parts.append([*filter(None, (*drawn, tradeoffs.swept_figure(grouped, panel)))])
     return parts if len(parts) > 1 else []
 
 

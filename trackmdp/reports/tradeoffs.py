@@ -1,24 +1,30 @@
-"""Figure of a frontier: accuracy against sensors per step and, where D is paid, the net accuracy below it."""
+"""Figures of accuracy against sensors per step: of a frontier, and of the policies of a sweep over prices."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from statistics import fmean
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from trackmdp.reports.figures import Panel
+from trackmdp.reports.grouping import Study
 from trackmdp.reports.style import (
     BLUE,
     INK,
+    REFERENCES,
     VERMILION,
     Axes,
     Canvas,
     Figure,
     draw_figure,
     legend,
+    looks_of,
     tidy,
 )
-from trackmdp.reports.tables import Column, Table
-from trackmdp.solvers.tradeoff import Mixture, Tradeoff
+from trackmdp.reports.tables import Cell, Column, Table
+from trackmdp.solvers.tradeoff import Mixture, Tradeoff, upper_hull
 
 _SEEN = 0.005
 """Gap from which the bound is drawn: a closer one lies on the line."""
@@ -66,3 +72,73 @@ def _draw(axes: Axes, found: Tradeoff, asked: Mapping[str, Mixture], name: str) 
             f"{key}={getattr(mixture, key):.4g}",
         )
         axes.plot(*point, color=VERMILION, marker=marker, ls="", label=label)
+
+
+class _Place(NamedTuple):
+    """A policy at a price; `net` is its accuracy."""
+
+    price: float
+    sensors: float
+    net: float
+
+
+_PLANE = ("sensors_per_step", "accuracy")
+
+
+def swept_figure(study: Study, panel: Panel) -> Figure | None:
+    """Learned policies at all prices over the frontier of the solver's; None where accuracy or sensors are unknown.
+
+    The frontier is the hull of the best policies known: a mixture of two neighbours attains each of its points. A
+    policy may lie above it, as D is paid as well.
+    """
+    learned = {method: _learned(study, panel, method) for method in study.methods}
+    best = [
+        _Place(price, *(study.reference(world, "best known", key) for key in _PLANE))
+        for price, world in zip(panel.costs, panel.worlds, strict=True)
+    ]
+    best = [each for each in best if np.isfinite(each).all()]
+    hull, name = upper_hull(best), study.title("best known")
+
+    def paint(figure: Canvas) -> None:
+        axes = figure.subplots()
+        _points(axes, hull, REFERENCES["best known"].of_line() | {"label": name})
+        # Also those below the line, which a mixture of their neighbours beats.
+        _points(axes, best, {"color": INK, "marker": "+", "linestyle": ""})
+        for method, look in looks_of(study.methods).items():
+            _points(axes, learned[method], look.of_line() | {"linestyle": "", "label": method})
+        axes.set(xlabel="sensors per step", ylabel="accuracy")
+        tidy(axes)
+        legend(figure, axes)
+
+    rows: list[list[Cell]] = [[name, *each, each in hull, None] for each in best]
+    seeds = {
+        (method, price): len(study.of(world, method))
+        for price, world in zip(panel.costs, panel.worlds, strict=True)
+        for method in study.methods
+    }
+    for method, places in learned.items():
+        rows += [[method, *each, None, seeds[method, each.price]] for each in places]
+    count = max((int(row[-1]) for row in rows if isinstance(row[-1], int)), default=0)
+    title = (
+        f"Accuracy against sensors per step at all prices, {panel.title}; line: mixtures of two "
+        f"policies, {name}; n = {count} seeds"
+    )
+    columns = [Column("policy"), Column("c", 2), Column("sensors per step", 3)]
+    columns += [Column("accuracy", 4), Column("on the line"), Column("n")]
+    table = Table(f"frontier-{panel.name}", title, columns, rows)
+    return draw_figure(title, table, 3.4, paint) if count else None
+
+
+def _learned(study: Study, panel: Panel, method: str) -> list[_Place]:
+    """Means over seeds at each price."""
+    found = []
+    for price, world in zip(panel.costs, panel.worlds, strict=True):
+        sensors, accuracy = (study.values(world, method, key) for key in _PLANE)
+        if sensors and accuracy:
+            # Means of both are what a run drawn at random attains: all have the same expected steps.
+            found.append(_Place(price, fmean(sensors), fmean(accuracy)))
+    return found
+
+
+def _points(axes: Axes, places: Sequence[_Place], look: Mapping[str, Any]) -> None:
+    axes.plot([each.sensors for each in places], [each.net for each in places], **look)

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 
@@ -246,9 +246,24 @@ class Tradeoff(Carded):
         return Mixture(self.corners[place], self.corners[place - 1], weight)
 
 
-def upper_hull(found: Sequence[Corner]) -> list[Corner]:
+class Placed(Protocol):
+    """Whatever has a place in the plane of the frontier."""
+
+    @property
+    def sensors(self) -> float:
+        """Sensors per step."""
+
+    @property
+    def net(self) -> float:
+        """Height."""
+
+
+P = TypeVar("P", bound=Placed)
+
+
+def upper_hull(found: Sequence[P]) -> list[P]:
     """Corners of the concave hull up to the greatest net, by rising sensors; points on an edge are none."""
-    hull: list[Corner] = []
+    hull: list[P] = []
     for corner in sorted(found, key=lambda each: (each.sensors, -each.net)):
         # More sensors have to bring more.
         if hull and corner.net <= hull[-1].net + ROUNDING * max(1.0, abs(corner.net)):
@@ -259,7 +274,7 @@ def upper_hull(found: Sequence[Corner]) -> list[Corner]:
     return hull
 
 
-def _bends(left: Corner, middle: Corner, right: Corner) -> bool:
+def _bends(left: Placed, middle: Placed, right: Placed) -> bool:
     """Whether the middle one of three lies above the chord of the others."""
     share = (middle.sensors - left.sensors) / max(right.sensors - left.sensors, 1e-300)
     chord = left.net + share * (right.net - left.net)
