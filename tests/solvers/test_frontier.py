@@ -262,3 +262,18 @@ def test_what_has_no_frontier_is_refused(world: Any, options: dict[str, Any], na
     with pytest.raises(UserError, match=named) as refused:
         frontier(world, **options)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("last", [0.16, 0.3])
+def test_cells_without_a_sensor_have_none_at_any_price(last: float) -> None:
+    prices = np.full((3, 3), 0.16)
+    prices[:, 0], prices[2, 2] = np.nan, last
+    world = tm.make_world("random_walk", size=3, cost=prices, safe_cost=1.0)
+    found = frontier(world)
+    assert found.equal_prices == (last == 0.16)
+    assert max(corner.sensors for corner in found.corners) > 0
+    for corner in found.corners:
+        assert not corner.table.dense()[..., [0, 3, 6]].any()
+    cost = found.corners[1].price * prices / np.nanmean(prices)
+    best = tm.solve(tm.make_world("random_walk", size=3, cost=cost, safe_cost=1.0))
+    assert found.corners[1].aihtr == pytest.approx(best.lower)

@@ -138,7 +138,7 @@ class _Trace:
         self.world, self.choice = world, choice
         self.resolution, self.on_progress, self.near = resolution, on_progress, near
         self.weights = relative_prices(world.cost)
-        self.equal_prices = bool((self.weights == 1.0).all())
+        self.equal_prices = bool((self.weights[world.available] == 1.0).all())
         self.hull: list[Corner] = []
         self.slopes: list[float] = []
         self.bounds: list[float] = []
@@ -230,6 +230,8 @@ class _Trace:
 
 
 def relative_prices(cost: Array) -> Array:
-    """`[S]`, each price over their mean; 1 where all are free."""
-    mean = float(cost.mean())
-    return cost / mean if mean > 0 and np.ptp(cost) > 0 else np.ones_like(cost)
+    """`[S]`, each price over their mean; 1 where all are free, nan where there is no sensor."""
+    known = cost[~np.isnan(cost)]
+    mean = float(known.mean())
+    equal = mean == 0 or np.ptp(known) == 0
+    return np.where(np.isnan(cost), np.nan, 1.0 if equal else cost / (mean or 1.0))
