@@ -22,6 +22,9 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("several")
     pair = tm.make_world("random_walk", size=3, exit_probability=0.2, targets=2)
     tm.train(pair, "model_based", folder=folder / "merged", **FEW)
+    tm.train(
+        pair, "model_based", seed=1, folder=folder / "brief", **FEW, **{"optimal.enabled": False}
+    )
     joint: dict[str, Any] = FEW | {"hidden": 8, "evaluation.width": 0.2}
     tm.train(pair, "a2c", folder=folder / "joint", **joint)
     tm.train(pair.kinds[0], "model_based", folder=folder / "single", **FEW)
@@ -63,6 +66,7 @@ def test_single_targets_are_no_reference_and_give_no_curve(sweep: Path) -> None:
     runs = {run.name: run for run in found.runs}
     for name in ("merged", "joint"):
         assert set(runs[name].references) == {"best known", "separate trackers", "clocked bound"}
+    assert set(runs["brief"].references) == {"clocked bound"}  # it was not solved for
     assert "Q_MDP" in runs["single"].references
     assert not runs["merged"].curve
     assert runs["joint"].curve and runs["single"].curve

@@ -76,9 +76,10 @@ def _references(summary: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         }
     if several := summary.get("several"):
         # Q_MDP and fixed sets are of a single target.
-        merged, bound = several["merged_optimum"], {"aihtr": several["upper"]}
-        apart = {"separate trackers": {"aihtr": several["apart"]}, "clocked bound": bound}
-        return ({"best known": _together(merged)} if merged else {}) | apart
+        merged, apart = several["merged_optimum"], several["apart"]
+        known = {"best known": _together(merged)} if merged else {}
+        known |= {} if apart is None else {"separate trackers": {"aihtr": apart}}
+        return {**known, "clocked bound": {"aihtr": several["upper"]}}
     policies = {"Q_MDP": summary["qmdp"], **summary.get("references", {})}
     found = {
         name: {key: each.get(key) for key in _TRACKED.values()}
