@@ -23,7 +23,7 @@ from tests.training.runs import BUDGET, QUICK, SMALL, assert_same_run, at_iterat
 from trackmdp.algos.common import make_algorithm
 from trackmdp.errors import Preempted, RunError, UserError
 from trackmdp.signals import Watch
-from trackmdp.training import checkpoint
+from trackmdp.training import checkpoint, collect
 from trackmdp.training.callbacks import Callback, Training
 from trackmdp.training.lock import locked
 from trackmdp.training.state import _weights
@@ -215,6 +215,23 @@ def test_a_worker_that_is_killed_is_named(
     train(tmp_path, f"collector={collector}", "resume=auto")
     assert saved(tmp_path)[0] == 8
     assert [int(row["iteration"]) for row in rows(tmp_path)] == list(range(1, 9))
+
+
+def dies(*_: Any) -> None:
+    """In place of an environment."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_a_worker_that_does_not_start_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(collect, "_worker_env", dies)
+    with pytest.raises(RunError) as told:
+        train(tmp_path, "collector=multi_sync")
+    line = str(told.value)
+    assert line.startswith("collector=multi_sync: a worker did not start (")
+    assert len(line.splitlines()) == 1
 
 
 def test_a_worker_ends_with_the_learner_that_was_killed() -> None:

@@ -14,6 +14,7 @@ from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, Mu
 from trackmdp.config import TrainConfig
 from trackmdp.config.learning import CollectorConfig, RayWorkersConfig, WorkersConfig
 from trackmdp.config.registry import maker
+from trackmdp.errors import RunError
 from trackmdp.imports import safe_children
 from trackmdp.seeding import derive
 from trackmdp.solvers.workers import end_with_parent
@@ -72,7 +73,11 @@ def _in_workers(
     device: torch.device,
     done: int = 0,
 ) -> BaseCollector:
-    """A collector of TorchRL's `kind` in worker processes; arguments as for `single`."""
+    """A collector of TorchRL's `kind` in worker processes; arguments as for `single`.
+
+    Raises:
+        RunError: a worker ended before it could collect.
+    """
     env = _env_options(cfg, seed)
     # A resumed run's workers have streams of their own (`done`), not the first ones again.
     workers = [
@@ -80,7 +85,12 @@ def _in_workers(
     ]
     threads = {"num_threads": torch.get_num_threads(), "num_sub_threads": cfg.threads}
     with safe_children():
-        return kind(workers, policy, **threads, **_common(cfg, device, done))
+        try:
+            return kind(workers, policy, **threads, **_common(cfg, device, done))
+        except (RuntimeError, EOFError, OSError) as error:
+            # TorchRL's message has the worker's whole traceback from its second line on.
+            reason = (str(error).splitlines() or [type(error).__name__])[0].strip()
+            raise RunError(f"collector={cfg.name}: a worker did not start ({reason})") from error
 
 
 multi_sync = partial(_in_workers, MultiSyncCollector)
