@@ -218,9 +218,8 @@ class HindsightLoss(nn.Module):
                 "clocked_actor": (loss * weights[0]).sum(),
             }
             if rows is slices[-1]:
-                begun = cells[0], torch.cat(targets)
                 losses["critic"] = _squared_error(value, own[0], plans.target)
-                losses["clocked_critic"] = _squared_error(clocked, *begun)
+                losses["clocked_critic"] = _squared_error(clocked, cells[0], torch.cat(targets))
             yield losses
 
     def _values(self) -> tuple[Tensor, Tensor]:
@@ -360,10 +359,10 @@ class HindsightLoss(nn.Module):
             value: V.
             blend: λ.
         """
-        (on, found), m, choices = policy, len(policy[0]), len(self.clocks)
+        (on, found), m = policy, self._keys.num_keys
         # [B], [T + 2, B] and [T + 1, B]: the free choices are for the first T + 1 moves, the last one is the forced
         # step.
-        start, moves = own[0], cells[1 : choices + 2]
+        start, moves = own[0], cells[1 : len(self.clocks) + 2]
         end = moves[:-1]
         row, entry, seen = self._places(start, end)
         # [T + 1, B], the probability of a report; 0 or 1 with sensors that never miss.

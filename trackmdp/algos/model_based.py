@@ -1,11 +1,10 @@
 """Model-based learning: estimate the motion from the observations, then plan with the estimate; no networks.
 
 Where the next move depends on the cell alone, the estimate is a kernel of pooled moves, planned on by the solvers.
-Where it may not, plans are made on whole sensed paths; a quarter of them, not used for learning,
-chooses between these plans, the plan of the pooled moves and, on small grids, the plan for a target whose next move
-depends on its last one. Steps are spent with all sensors on, or on sets
-planned for a kernel drawn from the posterior (posterior sampling, Thompson 1933), which costs far less and leaves moves
-to be inferred from misses.
+Where it may not, plans are made on whole sensed paths; a quarter of them, not used for learning, chooses between these
+plans, the plan of the pooled moves and, on small grids, the plan for a target whose next move depends on its last one.
+Steps are spent with all sensors on, or on sets planned for a kernel drawn from the posterior (posterior sampling,
+Thompson 1933), which costs far less and leaves moves to be inferred from misses.
 """
 
 from __future__ import annotations

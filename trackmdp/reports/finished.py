@@ -99,9 +99,8 @@ def _together(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 def _best_known(several: Mapping[str, Any]) -> float | None:
     """The largest AIHTR known to be attained: proved, or simulated of the merged optimum."""
-    merged = (several["merged_optimum"] or {"aihtr": {"mean": None}})["aihtr"]["mean"]
-    known = [value for value in (several["lower"], merged) if value is not None]
-    return max(known, default=None)
+    merged = _together(several["merged_optimum"] or {}).get("aihtr")
+    return max((value for value in (several["lower"], merged) if value is not None), default=None)
 
 
 def read_curve(place: Path, summary: Mapping[str, Any]) -> Sequence[Sequence[float]]:

@@ -118,7 +118,8 @@ def swept_figure(study: Study, panel: Panel) -> Figure | None:
     }
     for method, places in learned.items():
         rows += [[method, *each, None, seeds[method, each.price]] for each in places]
-    count = max((int(row[-1]) for row in rows if isinstance(row[-1], int)), default=0)
+    counts = (seeds[method, each.price] for method in learned for each in learned[method])
+    count = max(counts, default=0)
     title = (
         f"Accuracy against sensors per step at all prices, {panel.title}; line: mixtures of two "
         f"policies, {name}; n = {count} seeds"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -119,12 +119,9 @@ def compare(problem: Problem, policies: Mapping[str, Any] | Sequence[Any]) -> Co
     named = policies if isinstance(policies, Mapping) else _named(policies)
     if len(named) < 2:
         raise UserError(f"compare: {len(named)} policies, expected at least two")
+    tables = {name: _table(problem, name, policy) for name, policy in named.items()}
     if isinstance(problem, Recorded):
-        estimated = {"qmdp": lambda: as_policy(problem.task, estimated_qmdp(problem))}
-        return _on_tracks(
-            problem, {key: _table(problem, key, each, estimated) for key, each in named.items()}
-        )
-    tables = {name: _table(problem, name, policy, {}) for name, policy in named.items()}
+        return _on_tracks(problem, tables)
     rows: list[Compared] = []
     for name, table in tables.items():
         found = evaluate(problem, table, per_cell=False)
@@ -164,13 +161,11 @@ def _named(policies: Sequence[Any]) -> dict[str, Any]:
     }
 
 
-def _table(
-    problem: Problem, name: str, policy: Any, estimated: Mapping[str, Callable[[], Policy]]
-) -> Policy:
-    """The policy as a table; `estimated` makes those of baselines that need a motion, where none is known."""
+def _table(problem: Problem, name: str, policy: Any) -> Policy:
+    """The policy as a table."""
     try:
-        if isinstance(policy, str) and policy in estimated:
-            return estimated[policy]()
+        if policy == "qmdp" and isinstance(problem, Recorded):
+            policy = estimated_qmdp(problem)
         named = isinstance(policy, str)
         return named_policy(problem, policy) if named else as_policy(problem.task, policy)
     except UserError as error:

@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
+
 from trackmdp.errors import UserError, require
 from trackmdp.untrusted import decoded, opened
 from trackmdp.world.files import column_names, once
@@ -149,9 +151,10 @@ def _on_grid(
 ) -> tuple[Parts, Mapping[str, int], Place]:
     """See `read_track_file`."""
     # Drawn first: what is held out must not move the grid, nor change the draw by leaving it.
-    held_out, _ = draw_names(positions.track, *draw)
+    names = np.unique(positions.track)
+    held_out, _ = draw_names(names, *draw)
     tracks, loaded, place = to_tracks(positions, grid, source, held_out)
-    return split(tracks, *draw, names=positions.track), loaded, place
+    return split(tracks, *draw, names=names), loaded, place
 
 
 def _format_of(path: str | Path) -> str:
