@@ -31,6 +31,7 @@ PARTS = (
     "matrix",
     "bracket",
     "workers",
+    "values",
 )
 WORLD = ("grid.", "kernel", "cost.", "targets.")
 _RENAMED = {"cost.sensor": "cost", "cost.safe": "safe_cost", "targets.count": "targets"}
