@@ -35,7 +35,7 @@ _HOMES = {
     "Tradeoff": "trackmdp.solvers.tradeoff",
     "World": "trackmdp.world.model",
     "compare": "trackmdp.training.compare",
-    "evaluate": "trackmdp.solvers.value",
+    "evaluate": "trackmdp.solvers.evaluate",
     "export": "trackmdp.policies.export",
     "frontier": "trackmdp.solvers.frontier",
     "load_run": "trackmdp.training.run",
@@ -55,12 +55,12 @@ if TYPE_CHECKING:  # the same once more, for type checkers and editors; `X as X`
     from trackmdp.policies.export import export as export
     from trackmdp.policies.policy import Policy as Policy
     from trackmdp.policies.tracker import Tracker as Tracker
+    from trackmdp.solvers.evaluate import evaluate as evaluate
     from trackmdp.solvers.evaluation import Evaluation as Evaluation
     from trackmdp.solvers.frontier import frontier as frontier
     from trackmdp.solvers.solution import Solution as Solution
     from trackmdp.solvers.solve import solve as solve
     from trackmdp.solvers.tradeoff import Tradeoff as Tradeoff
-    from trackmdp.solvers.value import evaluate as evaluate
     from trackmdp.training.compare import compare as compare
     from trackmdp.training.run import Run as Run
     from trackmdp.training.run import load_run as load_run

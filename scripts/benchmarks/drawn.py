@@ -34,8 +34,8 @@ def drawn(kind: str, rng: np.random.Generator) -> dict[str, Any]:
         made["detection"] = rng.uniform(0.5, 1, cells)
         made["safe_detection"] = rng.uniform(0.5, 1, cells)
     if kind == "footprints":
-        made["coverage"] = (rng.random((5, cells)) < 0.4) | (
-            np.arange(cells) % 5 == np.arange(5)[:, None]
+        made["coverage"] = (rng.random((4, cells)) < 0.4) | (
+            np.arange(cells) % 4 == np.arange(4)[:, None]
         )
     if kind == "window":
         made["window"] = int(rng.integers(0, 3))

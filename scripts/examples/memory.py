@@ -15,7 +15,7 @@ import numpy as np
 import trackmdp as tm
 from trackmdp.algos.estimates.path_plans import choose_plan
 from trackmdp.config.world import MEMORIES
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.evaluator import HeldOutEvaluator
 
 RING = [1, 2, 3, 7, 11, 15, 14, 13, 12, 8, 4, 0]

@@ -14,8 +14,8 @@ from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.config import ScheduleConfig
 from trackmdp.policies.policy import as_policy
 from trackmdp.solvers import optimal
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
-from trackmdp.solvers.value import evaluate
 from trackmdp.world.model import World
 
 SHORT = (

@@ -9,8 +9,8 @@ from tests.helpers import algorithm, small_world, train_config
 from trackmdp.algos.hindsight import _within, budget
 from trackmdp.errors import UserError
 from trackmdp.solvers import bounds
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
-from trackmdp.solvers.value import evaluate
 from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import Task, World
 

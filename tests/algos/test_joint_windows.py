@@ -13,8 +13,8 @@ from torch.utils._pytree import tree_leaves
 import trackmdp
 from tests.helpers import algorithm, collect, random_state, small_world
 from trackmdp.policies.policy import Policy
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
-from trackmdp.solvers.value import evaluate
 from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import World
 from trackmdp.world.windows import Window

@@ -22,8 +22,8 @@ from trackmdp.algos.observed import observed_paths
 from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
 from trackmdp.solvers import optimal
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
-from trackmdp.solvers.value import evaluate
 from trackmdp.world.model import Task
 from trackmdp.world.tracks import Recorded
 

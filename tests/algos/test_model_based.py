@@ -20,8 +20,9 @@ from trackmdp.algos.observed import observed_paths
 from trackmdp.app.cli import main
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers import optimal
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
-from trackmdp.solvers.value import evaluate, replay
+from trackmdp.solvers.value import replay
 from trackmdp.training.run import load_run
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Recorded

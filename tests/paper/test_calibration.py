@@ -19,7 +19,7 @@ from trackmdp.paper.worlds import (
     paper_world,
 )
 from trackmdp.solvers import bounds, rules
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.evaluate import evaluate
 
 PAPER = Path(conf_dir()) / "experiment/paper.yaml"
 

@@ -14,8 +14,8 @@ from trackmdp.paper import proofs, theorems, worlds
 from trackmdp.paper.check import Check, summarize_checks
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, optimal, rules
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.solution import Solution
-from trackmdp.solvers.value import evaluate
 from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import BoolArray, World
 

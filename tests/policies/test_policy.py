@@ -21,7 +21,7 @@ from trackmdp.policies import lookup, policy
 from trackmdp.policies.forms import STATE_KEYS
 from trackmdp.policies.nets import SubsetDistribution
 from trackmdp.policies.policy import Policy, actor_table, as_policy
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import Task, World
 
 WORLD = small_world(t_max=2)

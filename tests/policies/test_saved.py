@@ -18,7 +18,7 @@ from trackmdp.policies import saved
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.saved import load_policy, save_policy
 from trackmdp.solvers import rules
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import Task
 from trackmdp.world.place import Place
 from trackmdp.world.problem_file import read_problem

@@ -26,7 +26,7 @@ from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.page import build
 from trackmdp.reports.results import RESULTS, Results, load_results, save_results
 from trackmdp.solvers import bounds, rules
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.folders import read_summary, write_summary
 from trackmdp.training.lock import locked
 from trackmdp.world.make import build_world

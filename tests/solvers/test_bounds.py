@@ -15,7 +15,7 @@ from tests.solvers.worlds import (
     tiny_worlds,
 )
 from trackmdp.solvers import bounds, rules
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import World
 
 

@@ -11,13 +11,13 @@ from tests.solvers.worlds import all_plans, best_of_all, paper_world, random_tin
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, delayed, optimal, search
 from trackmdp.solvers.branch import Tree
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.inner import InnerProblem
 from trackmdp.solvers.joint import Joint
 from trackmdp.solvers.known import tables
 from trackmdp.solvers.optimal import payment
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.solution import SearchProgress
-from trackmdp.solvers.value import evaluate
 from trackmdp.world.model import World
 
 

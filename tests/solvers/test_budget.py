@@ -17,10 +17,10 @@ from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers import rules
 from trackmdp.solvers.choose import largest
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.frontier import frontier
 from trackmdp.solvers.lookahead import solve as looked_ahead
 from trackmdp.solvers.solve import solve
-from trackmdp.solvers.value import evaluate
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import World
 

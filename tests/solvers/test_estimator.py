@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from tests.solvers.worlds import paper_world, tiny_worlds
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import estimator, optimal, rules
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import BoolArray, World
 
 

@@ -16,8 +16,8 @@ from trackmdp.episodes.filtered import _declared, _posterior, simulate_filter
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, rules
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.false_alarms import believed
-from trackmdp.solvers.value import evaluate
 from trackmdp.world.make import make_world
 from trackmdp.world.model import Array, World
 

@@ -13,9 +13,9 @@ import pytest
 import trackmdp as tm
 from tests.solvers.worlds import all_plans
 from trackmdp.errors import UserError
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.frontier import FrontierProgress, frontier
 from trackmdp.solvers.tradeoff import Tradeoff
-from trackmdp.solvers.value import evaluate
 from trackmdp.world.model import Array, World
 
 

@@ -16,13 +16,13 @@ from trackmdp.app.cli import main
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers import group_value
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.group_bounds import equal_shares, upper_bound
 from trackmdp.solvers.group_chain import explored
 from trackmdp.solvers.group_value import evaluate_group
 from trackmdp.solvers.linear import IndexArray
 from trackmdp.solvers.merging import Beliefs, Clocks, make_rule
 from trackmdp.solvers.solve import solve
-from trackmdp.solvers.value import evaluate
 from trackmdp.world.group import Group
 from trackmdp.world.model import Array, World
 

@@ -8,10 +8,10 @@ import torch
 
 from tests.helpers import headings
 from trackmdp.solvers import bounds, exchange, hidden, optimal, search
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found
 from trackmdp.solvers.solve import solve
-from trackmdp.solvers.value import evaluate
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import World
 from trackmdp.world.modes import heading_kernel

@@ -13,9 +13,9 @@ from tests.helpers import random_kernel
 from trackmdp.errors import UserError
 from trackmdp.solvers import linear, renewal, rules, value
 from trackmdp.solvers.bounds import clocked_table
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.linear import RenewalSystem, accumulate, expected_steps
 from trackmdp.solvers.optimal import solve
-from trackmdp.solvers.value import evaluate
 from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import World
 

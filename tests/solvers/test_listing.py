@@ -9,11 +9,11 @@ from tests.helpers import headings
 from tests.solvers.worlds import best_of_all, footprint_world
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import listing
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.exchange import revealed
 from trackmdp.solvers.linear import forced_worth
 from trackmdp.solvers.listing import Listed, best_plans
 from trackmdp.solvers.renewal import Renewal
-from trackmdp.solvers.value import evaluate
 from trackmdp.world.model import Array, World
 
 WORLDS = {

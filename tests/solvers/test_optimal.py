@@ -20,11 +20,11 @@ from tests.solvers.worlds import (
 )
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, delayed, optimal, search
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.inner import InnerProblem
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found, candidates_of, columns_of
 from trackmdp.solvers.solution import SearchProgress
-from trackmdp.solvers.value import evaluate
 from trackmdp.world.kernels import drift, random_walk
 from trackmdp.world.model import BoolArray, World
 

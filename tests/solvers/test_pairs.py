@@ -31,10 +31,11 @@ from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import candidates_of
 from trackmdp.solvers.solve import solve
-from trackmdp.solvers.value import evaluate, key_visits, visits_of
+from trackmdp.solvers.value import key_visits, visits_of
 from trackmdp.world.model import Task, World
 from trackmdp.world.tracks import Problem, Recorded
 

@@ -14,8 +14,9 @@ from tests.helpers import limited, small_world
 from tests.tracks import by_hand, drawn, recorded
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import ReplayedTracks
-from trackmdp.solvers.value import evaluate, replay
+from trackmdp.solvers.value import replay
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import BoolArray, Task
 from trackmdp.world.tracks import Recorded, Tracks

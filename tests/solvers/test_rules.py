@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from tests.solvers.worlds import all_plans, followed, paper_world, tiny_worlds
 from trackmdp.solvers import lookahead, optimal, rules
 from trackmdp.solvers.bounds import clocked_table
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import World
 
 

@@ -16,9 +16,9 @@ from tests.solvers.worlds import best_of_all, paper_world, tiny_worlds
 from trackmdp.config import GROUPS
 from trackmdp.errors import UserError
 from trackmdp.solvers import bounds, optimal
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.solution import SearchProgress, Solution
 from trackmdp.solvers.solve import solve
-from trackmdp.solvers.value import evaluate
 from trackmdp.world.model import World
 
 SOLVERS = sorted(GROUPS["solver"])

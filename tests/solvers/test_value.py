@@ -15,9 +15,10 @@ from tests.solvers.worlds import REFERENCES, reference_world
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, rules, value
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
 from trackmdp.solvers.linear import expected_steps
-from trackmdp.solvers.value import evaluate, key_visits
+from trackmdp.solvers.value import key_visits
 from trackmdp.world.model import World
 
 

@@ -14,7 +14,7 @@ import pytest
 import trackmdp as tm
 from trackmdp.app.cli import main
 from trackmdp.errors import Preempted, UserError
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.callbacks import Callback
 from trackmdp.training.lock import locked
 from trackmdp.training.state import Checkpoints

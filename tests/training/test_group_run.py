@@ -20,11 +20,11 @@ from trackmdp.app.cli import main
 from trackmdp.config import load_run_config
 from trackmdp.errors import Preempted, UserError
 from trackmdp.seeding import derive
+from trackmdp.solvers.evaluate import evaluate, group_rule
 from trackmdp.solvers.group_tracker import GroupTracker
 from trackmdp.solvers.group_value import evaluate_group
 from trackmdp.solvers.joint_rule import JointRule
 from trackmdp.solvers.solve import solve
-from trackmdp.solvers.value import evaluate, group_rule
 from trackmdp.training.inputs import problem_of
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.group import Group

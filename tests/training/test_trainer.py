@@ -12,7 +12,7 @@ from tests.helpers import train_config
 from tests.training.runs import BUDGET, QUICK, rows, train
 from trackmdp.app.commands.train import run
 from trackmdp.config import CheckpointConfig
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.callbacks import Position
 from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.training.state import Checkpoints

@@ -18,7 +18,7 @@ from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import load_policy, read_sets, save_policy, write_sets
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.coverage import Coverage, discs
 from trackmdp.world.dynamics import Dynamics
 from trackmdp.world.env import TrackEnv

@@ -11,8 +11,8 @@ from torchrl.envs.utils import check_env_specs
 
 import trackmdp as tm
 from trackmdp.errors import UserError
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.solve import solve
-from trackmdp.solvers.value import evaluate
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.group import Group
 from trackmdp.world.model import World

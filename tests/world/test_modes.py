@@ -20,7 +20,7 @@ from trackmdp.config.roots import SolveConfig
 from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.make import make_problem
 from trackmdp.world.model import World

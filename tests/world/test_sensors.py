@@ -16,7 +16,7 @@ from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.saved import load_policy, save_policy
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.dynamics import Dynamics
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.make import make_world

@@ -35,7 +35,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers import exchange, hidden
 from trackmdp.solvers.linear import DIRECT_CELLS
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.value import value_of
 from trackmdp.world.model import Task, World
 from trackmdp.world.tracks import Tracks
 
@@ -188,10 +188,10 @@ class ModelBased:
 
     def _beliefs(self, plan: PolicyTable, world: World) -> dict[str, float]:
         """AIHTR of a plan by the posterior mean, and its standard deviation over kernels that are drawn."""
-        mean = evaluate(world, plan, per_cell=False)
+        mean = value_of(world, plan, per_cell=False)
         others = map(self._world, self._estimate.samples(self._rng, _SAMPLES))
         # Each begins with the mean kernel's values, which counts where the grid is too large to factorise.
-        worth = [evaluate(other, plan, guess=mean.value, per_cell=False).aihtr for other in others]
+        worth = [value_of(other, plan, guess=mean.value, per_cell=False).aihtr for other in others]
         return {"believed_aihtr": mean.aihtr, "believed_deviation": float(np.std(worth))}
 
     def _diagnostics(self) -> dict[str, float]:

@@ -21,9 +21,10 @@ from trackmdp.errors import UserError
 from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import PolicyLike
 from trackmdp.seeding import derive, preserved_global_rng
+from trackmdp.solvers.evaluate import group_rule
 from trackmdp.solvers.merging import Rule
 from trackmdp.solvers.solve import named_policy
-from trackmdp.solvers.value import check_revealed, group_rule
+from trackmdp.solvers.value import check_revealed
 from trackmdp.world.group import Group
 from trackmdp.world.outcomes import Costs, Outcomes
 from trackmdp.world.paths import PathSampler, path_sampler

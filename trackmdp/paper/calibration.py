@@ -21,7 +21,7 @@ from trackmdp.paper import theorems
 from trackmdp.paper.check import Check
 from trackmdp.paper.worlds import COSTS, PRINTED_QMDP, SUPPORTS, paper_kernel, paper_world
 from trackmdp.solvers import bounds, optimal, rules
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.value import value_of
 from trackmdp.untrusted import decoded, read_object
 from trackmdp.world.kernels import Border
 from trackmdp.world.model import Array
@@ -131,7 +131,7 @@ def _figures(border: Border, t_max: int, support_size: int, draws: Sequence[int]
         kernel = paper_kernel(support_size, seed, border)
         for column, cost in enumerate(COSTS):
             world = paper_world(kernel, cost, t_max)
-            value = evaluate(world, rules.qmdp(world))
+            value = value_of(world, rules.qmdp(world))
             figures[row, column] = 100.0 * value.accuracy, value.aihtr, bounds.clocked(world).mean()
     return figures
 

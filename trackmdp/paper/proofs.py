@@ -22,7 +22,7 @@ from trackmdp.solvers import bounds, optimal, pomdp, rules
 from trackmdp.solvers.inner import InnerProblem
 from trackmdp.solvers.known import planted, up_to
 from trackmdp.solvers.renewal import Renewal
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.value import value_of
 from trackmdp.world.model import Array, World
 
 BUDGETS = (1, 10, 100, 1_000_000)
@@ -38,7 +38,7 @@ def of_values(small: World) -> Iterator[Check]:
     for world in worlds:
         sets = rng.random((world.num_keys, world.num_choices, world.num_cells)) < 0.5
         policy = PolicyTable.from_dense(world, sets)
-        error = np.abs(evaluate(world, policy).value - policy_value(world, policy))
+        error = np.abs(value_of(world, policy).value - policy_value(world, policy))
         worst = max(worst, float(error.max()))
     statement = (
         "the exact value of a policy equals the chain's over (state, last detection, misses)"
@@ -60,7 +60,7 @@ def of_searches() -> Iterator[Check]:
     """Branch and bound over a poor policy, in worlds that need it, against all plans and the POMDP's optimum."""
     tree, bracket, payment = NO_CASE, NO_CASE, NO_CASE
     for world in searched_worlds():
-        value = evaluate(world, rules.qmdp(world)).value
+        value = value_of(world, rules.qmdp(world)).value
         exact = best_worth(world, value, np.eye(world.num_cells), world.num_choices)
         optimum = pomdp.solve(world).value
         for nodes in BUDGETS:

@@ -16,7 +16,7 @@ from trackmdp.solvers import bounds, estimator, pomdp, rules
 from trackmdp.solvers import optimal as optimum
 from trackmdp.solvers.hidden import averaged
 from trackmdp.solvers.solution import Solution
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.value import value_of
 from trackmdp.world.model import Array, BoolArray, World
 
 SLACK = 1e-10
@@ -76,7 +76,7 @@ def check_modes(world: World, solution: Solution, tolerance: float) -> Iterator[
     scale = tolerance * max(1.0, float(np.abs(solution.bound).max()))
     for row in (*proofs.of_values(corner(world)), *proofs.of_bounds(corner(world))):
         yield row.judged(scale)
-    plain, bound = evaluate(world, rules.qmdp(averaged(world))), bounds.clocked(world)
+    plain, bound = value_of(world, rules.qmdp(averaged(world))), bounds.clocked(world)
     note = f"found {solution.lower:.6f}, bound {bound.mean():.6f}"
     above = float((solution.value - bound).max())
     statement = "the policy found <= clocked bound, which knows the mode"
@@ -261,7 +261,7 @@ def _order(world: World, solution: Solution) -> Iterator[Check]:
     # Each relaxes the next: play without knowing, known with the clock, known without it. The inequality holds cell by
     # cell: the largest difference over start cells is checked; the notes give the means, which are AIHTRs.
     upper, valid, printed = bounds.clocked(world), bounds.valid(world), bounds.paper(world)
-    others = evaluate(world, rules.qmdp(world)).value
+    others = value_of(world, rules.qmdp(world)).value
     gap = f"gap {solution.upper - solution.lower:.2g}"
     rows = (
         ("Q_MDP <= optimum", others, solution.bound, f"optimum {solution.lower:.6f}, {gap}"),
@@ -293,7 +293,7 @@ def _printed_bound() -> Check:
     # One counter-example is enough: the printed bound charges c for every sensor on the exit step, the reward does not.
     world = paper_world(paper_kernel(5, seed=5, border="inside"), 0.16, 5)
     printed = bounds.paper(world).mean()
-    achieved = evaluate(world, rules.clocked_policy(world)).aihtr
+    achieved = value_of(world, rules.clocked_policy(world)).aihtr
     note = f"bound {printed:.2f}, a policy attains {achieved:.2f} (border inside, Z = 5, c = 0.16, t_max 5)"
     statement = "no policy exceeds the printed bound"
     excess = float(achieved - printed)

@@ -1,6 +1,6 @@
 """The one policy: which sensors are on n misses after the target was located in x, as a table or as one number.
 
-After a miss the next state is known in advance (`solvers/evaluate.py`), so a deterministic policy of a Track-MDP
+After a miss the next state is known in advance (`solvers/value.py`), so a deterministic policy of a Track-MDP
 is one open-loop plan per located cell: the sets sensed at n = 0 ... t_max misses, followed until the next detection.
 All plans together are a sparse matrix with a row per pair (x, n) and a column per sensor.
 """

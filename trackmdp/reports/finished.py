@@ -20,7 +20,7 @@ from trackmdp.reports.results import FIGURES, HELD_OUT, FinishedRun, Mapped, che
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.hidden import averaged
 from trackmdp.solvers.linear import DIRECT_CELLS, IndexArray, per_row
-from trackmdp.solvers.value import evaluate, key_visits
+from trackmdp.solvers.value import key_visits, value_of
 from trackmdp.training.folders import METRICS, SUMMARY, check_files, read_summary
 from trackmdp.untrusted import LARGE, decoded, parse_yaml, read_text
 from trackmdp.world.model import Array, World
@@ -198,5 +198,5 @@ def _references_by_cell(problem: World) -> tuple[sparse.csr_array, Array, Array]
     m = world.num_cells
     kernel = world.kernel if m <= MOST_MAP_CELLS else sparse.csr_array(world.kernel.shape)
     # Q_MDP on a large grid takes minutes and gigabytes where it senses little.
-    simple = evaluate(problem, rules.qmdp(world)).value if m <= DIRECT_CELLS else np.full(m, np.nan)
+    simple = value_of(problem, rules.qmdp(world)).value if m <= DIRECT_CELLS else np.full(m, np.nan)
     return kernel, bound, simple

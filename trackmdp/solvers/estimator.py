@@ -17,7 +17,7 @@ from trackmdp.solvers.inner import InnerProblem
 from trackmdp.solvers.known import tables, up_to
 from trackmdp.solvers.linear import IndexArray, per_row
 from trackmdp.solvers.renewal import Renewal
-from trackmdp.solvers.value import evaluate, key_visits
+from trackmdp.solvers.value import key_visits, value_of
 from trackmdp.solvers.walk import Step
 from trackmdp.world.model import Array, BoolArray, World
 
@@ -90,7 +90,7 @@ def accuracy(world: World, policy: PolicyTable, value: Array | None = None) -> E
         policy: the one that senses.
         value: `[M]`, V of the Q-values; the policy's own where not given.
     """
-    own = evaluate(world, policy).value if value is None else value
+    own = value_of(world, policy).value if value is None else value
     visits = key_visits(world, policy)
     missed, right = 0.0, np.zeros(3)
     for estimate in positions(world, policy, own):

@@ -24,7 +24,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.solution import Solution
 from trackmdp.solvers.solve import run_solver
 from trackmdp.solvers.tradeoff import ROUNDING, Corner, Tradeoff, height, slope, upper_hull
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.value import value_of
 from trackmdp.world.model import Array, World
 from trackmdp.world.tracks import Problem, check_problem, modelled
 
@@ -175,7 +175,7 @@ class _Trace:
             return sensors
         # Without rewards the value of an episode is its payment for sensors.
         paid = replace(self.world, cost=self.weights, reward=0.0, safe_cost=0.0)
-        return max(0.0, -evaluate(paid, table, per_cell=False).aihtr / self.steps)
+        return max(0.0, -value_of(paid, table, per_cell=False).aihtr / self.steps)
 
     def ends(self) -> None:
         """The corners of the lowest and of the highest price."""

@@ -19,7 +19,7 @@ from trackmdp.solvers.exchange import best_of, exchanged, other_starts
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found, clocked_sets, follow_credit
 from trackmdp.solvers.solution import Solution
-from trackmdp.solvers.value import averaged_kernel, evaluate
+from trackmdp.solvers.value import averaged_kernel, value_of
 from trackmdp.world.model import World
 
 _STEPS, _SWEEPS = 12, 1
@@ -36,7 +36,7 @@ def solve(world: World, *, start: PolicyTable | None = None) -> Solution:
     """
     began = time.monotonic()
     table = best_found(world, start=start)
-    evaluation = evaluate(world, table)
+    evaluation = value_of(world, table)
     bound = np.maximum(optimal.solve(revealing(world)).bound, evaluation.value)
     gap = float((bound - evaluation.value).mean())
     certified = gap <= 1e-6 * max(1.0, abs(evaluation.aihtr))

@@ -33,7 +33,7 @@ from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.rules import clocked_policy
 from trackmdp.solvers.search import Found, clocked_sets, follow_credit
 from trackmdp.solvers.solution import SearchProgress, Solution
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.value import value_of
 from trackmdp.world.model import Array, World
 
 ROUNDING = 1e-10
@@ -127,7 +127,7 @@ class _Run:
         self.evaluation = self.valued(self.policy, self.bound)
 
     def valued(self, policy: PolicyTable, guess: Array) -> Evaluation:
-        return evaluate(self.world, policy, guess=guess, per_cell=False)
+        return value_of(self.world, policy, guess=guess, per_cell=False)
 
     @property
     def value(self) -> Array:

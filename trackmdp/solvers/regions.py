@@ -28,7 +28,7 @@ from trackmdp.solvers.linear import DIRECT_CELLS, IndexArray, forced_worth
 from trackmdp.solvers.partition import Pairs, blocks, cells_of, end_to_end, reach, sub_world, within
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import candidates_of, columns_of
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.value import value_of
 from trackmdp.solvers.workers import Crew, Made, in_turn
 from trackmdp.world.model import Array, BoolArray, World
 
@@ -202,12 +202,12 @@ def settled(
     Blocks that planned without each other's values leave plans that none of them would change: .006 per step at
     c = .22, T_max 2, blocks of 5 and a halo of 4.
     """
-    value = evaluate(world, policy, per_cell=False).value
+    value = value_of(world, policy, per_cell=False).value
     for _ in range(rounds):
         candidate = PolicyTable.from_sensed(
             world, end_to_end(run(_Region.improved, _regions(world, policy, value, side)))
         )
-        after = evaluate(world, candidate, guess=value, per_cell=False).value
+        after = value_of(world, candidate, guess=value, per_cell=False).value
         # As in `exchange`: no value is lower, so the sum decides; the margin is rounding.
         if after.sum() <= value.sum() + 1e-12 * np.abs(value).sum():
             break

@@ -12,7 +12,7 @@ from trackmdp.notebook.card import Card, Carded, decimal, grid_words
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked
 from trackmdp.solvers.evaluation import Evaluation
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.value import value_of
 from trackmdp.world.model import Array, World
 
 if TYPE_CHECKING:  # torch is loaded where a policy is to act
@@ -114,7 +114,7 @@ def bracketed(
     world: World, table: PolicyTable, seconds: float, tolerance: float = 1e-6
 ) -> Solution:
     """A policy found in another way, in `seconds`, with the clocked bound as the proved one."""
-    evaluation = evaluate(world, table, per_cell=False)
+    evaluation = value_of(world, table, per_cell=False)
     bound = np.maximum(clocked(world), evaluation.value)
     gap = float((bound - evaluation.value).mean()) + evaluation.error
     certified = gap <= tolerance * max(1.0, abs(evaluation.aihtr))

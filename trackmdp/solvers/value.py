@@ -12,8 +12,7 @@ becomes a backward recursion over them. Nothing diverges where the target never 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, TypeAlias, overload
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from scipy import sparse
@@ -34,14 +33,12 @@ from trackmdp.solvers.linear import (
     triangular,
 )
 from trackmdp.solvers.walk import Events, Passed, Walk, all_events, passed
-from trackmdp.world.group import Group
 from trackmdp.world.model import Array, BoolArray, Task, World
 from trackmdp.world.motion import Motion
-from trackmdp.world.tracks import Problem, Recorded, Tracks, check_problem
+from trackmdp.world.tracks import Problem, Recorded, Tracks
 
 if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its sets
     from trackmdp.policies.policy import PolicyLike
-    from trackmdp.solvers.group_figures import GroupEvaluation
 
 KEYED_DIRECT = 700
 """Events of several keys or modes a cell up to which their system is factorised, as a full matrix: each leads to all
@@ -51,60 +48,28 @@ Followed: TypeAlias = tuple[Events, Iterator[Passed]]
 """Events that a policy leads to, and their steps."""
 
 
-@overload
-def evaluate(
+def value_of(
     problem: Problem,
     policy: PolicyLike | Array | BoolArray,
     *,
-    guess: Array | None = ...,
-    false_alarm: float = ...,
-    per_cell: bool = ...,
-) -> Evaluation: ...
-@overload
-def evaluate(
-    problem: Group, policy: PolicyLike, *, merge: str = ..., width: float = ..., seed: int = ...
-) -> GroupEvaluation: ...
-
-
-def evaluate(
-    problem: Problem | Group,
-    policy: PolicyLike | Array | BoolArray,
-    *,
     guess: Array | None = None,
-    false_alarm: float = 0.0,
     per_cell: bool = True,
-    **of_group: Any,
-) -> Evaluation | GroupEvaluation:
-    """The figures of `policy`: exact on a `World`, from a replay on the held-out tracks of a `Recorded`.
+) -> Evaluation:
+    """The figures of a policy of one target; `trackmdp.solvers.evaluate` takes names and several targets as well.
 
     Args:
-        problem: a `World`, whose episodes end by the target's exit or after `max_steps`; `Recorded` tracks; or a
-            `Group` of targets, for which a policy of a single one is merged, and simulated unless the grid is tiny.
+        problem: a `World`, whose episodes end by the target's exit or after `max_steps`; or `Recorded` tracks.
         policy: a `Policy` or its table, or the same dense, `[M, t_max + 1, M]`; a TensorDict module or a function
-            that does not draw (`Policy.from_function`); a `Run`, a `Solution`, a model of Stable-Baselines3; or the
-            name of a baseline.
-        false_alarm: p_f, with which a sensor that is on reports the target in a step in which it is not there; the
-            policy takes each report for the truth (`trackmdp.solvers.false_alarms`).
+            that does not draw (`Policy.from_function`); a `Run`, a `Solution`, or a model of Stable-Baselines3.
+        guess: `[M]`, where the solve begins on a grid too large to factorise, such as the clocked bound.
         per_cell: whether detections, sensors and safe actions are wanted of each start cell as well, which takes half
             as long again on a grid too large to factorise (a smaller one has them for nothing).
-        **of_group: of a `Group` alone: `merge`, "gains" or "union"; `width`, half of the 95 % interval of the reward
-            per step that is wanted, .005; and `seed` of the targets.
-        guess: `[M]`, where the solve begins on a grid too large to factorise, such as the clocked bound.
 
     Raises:
         UserError: the policy draws at random with unknown probabilities, or is for another grid.
     """
-    if isinstance(problem, Group):
-        return _of_group(problem, policy, **of_group)
-    check_problem(problem, "evaluate")
-    if of_group:
-        raise UserError(f"{min(of_group)}: an option of several targets, expected none with one")
-    table = _table(problem, policy)
+    table = as_table(problem, policy)
     check_revealed(problem.motion, table)
-    if false_alarm:
-        from trackmdp.solvers.false_alarms import believed
-
-        return believed(problem, table, false_alarm)
     if isinstance(problem, Recorded):
         tracks = problem.held_out.limited(problem.max_steps)
         starts = tracks.cells[tracks.first[:-1]]
@@ -112,30 +77,6 @@ def evaluate(
     if problem.max_steps is not None:
         return truncated_value(problem, table, problem.max_steps)
     return _whole_episodes(problem, table, guess, per_cell)
-
-
-def _of_group(
-    group: Group, policy: Any, *, merge: str = "gains", width: float = 0.005, seed: int = 0
-) -> GroupEvaluation:
-    """See `evaluate`."""
-    # By name, as this module is built on this one.
-    value = import_module("trackmdp.solvers.group_value")
-    found: GroupEvaluation = value.evaluate_group(
-        group_rule(group, policy, merge), width=width, seed=seed
-    )
-    return found
-
-
-def group_rule(group: Group, policy: Any, merge: str = "gains") -> Any:
-    """The `merging.Rule` of a policy for several targets: itself, or the merged plans of single ones."""
-    merging = import_module("trackmdp.solvers.merging")
-    if isinstance(policy, merging.Rule):
-        return policy.within(group)
-    if (tables := getattr(policy, "tables", None)) is None:
-        if isinstance(held := getattr(policy, "policy", None), merging.Rule):
-            return held.within(group)
-        tables = [_table(world, policy) for world in group.kinds]
-    return merging.make_rule(group, tables, merge)
 
 
 def follow(task: Task, motion: Motion, policy: PolicyTable) -> Followed:
@@ -170,7 +111,7 @@ def _steps(task: Task, motion: Motion, events: Events, policy: SetTable) -> Iter
 
 
 def truncated_value(world: World, policy: PolicyTable, max_steps: int) -> Evaluation:
-    """The figures of `evaluate` for episodes of at most `max_steps` steps.
+    """The figures of `value_of` for episodes of at most `max_steps` steps.
 
     With h steps left, V_h = Σ_t [b_t + L_t V_{h-t}] over the steps t = 1 ... min(h, t_max + 2) after a detection:
     b_t is gathered at step t, and L_t is the distribution of the target if located at step t. The last t_max + 2 V_h
@@ -380,17 +321,13 @@ def averaged_kernel(motion: Motion, num_cells: int) -> sparse.csr_array:
     return sparse.csr_array(out @ motion.moves @ into)
 
 
-def _table(problem: Problem, policy: PolicyLike | Array | BoolArray) -> PolicyTable:
-    """The table of a policy in any accepted form; torch is loaded only for modules and functions."""
+def as_table(problem: Problem, policy: PolicyLike | Array | BoolArray) -> PolicyTable:
+    """The table of a policy in any form but a name; torch is loaded only for modules and functions."""
     if isinstance(policy, PolicyTable):
         policy.check_fits(problem)
         return policy
     if isinstance(policy, np.ndarray):
         return PolicyTable.from_dense(problem, policy)
-    if isinstance(policy, str):
-        # By name, like all choices: solvers are built on this module.
-        found: PolicyTable = import_module("trackmdp.solvers.solve").named_policy(problem, policy)
-        return found
     from trackmdp.policies.policy import as_policy
 
     return as_policy(problem, policy)

@@ -12,7 +12,7 @@ from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, decimal, percent
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.solvers.solve import named_policy
-from trackmdp.solvers.value import evaluate, replay
+from trackmdp.solvers.value import replay, value_of
 from trackmdp.statistics import MeanInterval, ratio
 from trackmdp.training.evaluator import estimated_qmdp
 from trackmdp.world.tracks import Problem, Recorded, check_problem
@@ -104,10 +104,10 @@ def compare(problem: Problem, policies: Mapping[str, Any] | Sequence[Any]) -> Co
 
     Args:
         problem: a world or recorded tracks.
-        policies: name -> policy, or a list; each as for `evaluate`, or the name of a baseline.
+        policies: name -> policy, or a list; each as for `tm.evaluate`, or the name of a baseline.
 
     Raises:
-        UserError: fewer than two policies, or one that `evaluate` refuses; the message names it.
+        UserError: fewer than two policies, or one that `tm.evaluate` refuses; the message names it.
 
     Example:
         >>> from trackmdp import Policy, make_world
@@ -124,7 +124,7 @@ def compare(problem: Problem, policies: Mapping[str, Any] | Sequence[Any]) -> Co
         return _on_tracks(problem, tables)
     rows: list[Compared] = []
     for name, table in tables.items():
-        found = evaluate(problem, table, per_cell=False)
+        found = value_of(problem, table, per_cell=False)
         figures = {key: _exact(getattr(found, key)) for key in FIGURES}
         first = (rows[0].figures if rows else figures)["aihtr"].mean
         rows.append(Compared(name, figures, _exact(found.aihtr - first)))

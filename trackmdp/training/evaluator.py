@@ -16,7 +16,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluation import Evaluation, ReplayedTracks, regret_per_step
 from trackmdp.solvers.hidden import averaged
-from trackmdp.solvers.value import evaluate, replay
+from trackmdp.solvers.value import replay, value_of
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 
@@ -74,7 +74,7 @@ class Evaluator:
 
     def evaluate(self, policy: PolicyTable) -> Evaluation:
         """Figures of a policy: exact, or those on the held-out tracks."""
-        return evaluate(self.world, policy, per_cell=False)
+        return value_of(self.world, policy, per_cell=False)
 
     def score(self, policy: PolicyTable) -> Score:
         """Figures and the regret per step, by which a policy may be chosen: while learning, for best.pt."""
@@ -111,7 +111,7 @@ class ExactEvaluator(Evaluator):
             self.bounds["paper"] = float(bounds.paper(world).mean())
         self.bounds["valid"] = float(bounds.valid(world).mean())
         self.upper = self.bounds["clocked"] = float(bounds.clocked(world).mean())
-        self.qmdp = evaluate(world, rules.qmdp(averaged(world)))
+        self.qmdp = value_of(world, rules.qmdp(averaged(world)))
         self.lower = self.qmdp.aihtr
 
 
@@ -139,7 +139,7 @@ class HeldOutEvaluator(Evaluator):
 
     def score(self, policy: PolicyTable) -> Score:
         """Figures of a policy on the validation tracks."""
-        return Score(evaluate(self.world.selection, policy), math.nan, math.nan)
+        return Score(value_of(self.world.selection, policy), math.nan, math.nan)
 
     def replayed(self, policy: PolicyTable) -> ReplayedTracks:
         """The totals of a policy on the held-out tracks."""

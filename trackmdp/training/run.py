@@ -25,9 +25,9 @@ from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import load_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import optimal
+from trackmdp.solvers.evaluate import group_rule
 from trackmdp.solvers.evaluation import Evaluation, figures
 from trackmdp.solvers.solution import Solution
-from trackmdp.solvers.value import group_rule
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Learning, Row, Training
 from trackmdp.training.devices import machine

@@ -14,7 +14,8 @@ from trackmdp.algos.estimates.path_counts import Planned, plan_paths
 from trackmdp.algos.estimates.path_gains import Paths
 from trackmdp.config.world import MEMORIES
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers.value import evaluate, replay
+from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.value import replay
 from trackmdp.world.model import Task
 from trackmdp.world.tracks import Recorded, Tracks
 

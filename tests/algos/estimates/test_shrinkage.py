@@ -11,7 +11,7 @@ from scipy import sparse
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.estimates.shrinkage import least_worth_planning, posterior_mean, unseen, without
 from trackmdp.solvers import exchange, optimal
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.make import make_world
 from trackmdp.world.model import World, apart
 

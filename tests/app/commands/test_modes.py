@@ -109,9 +109,9 @@ def test_large_systems_are_iterated_to_the_same_value(monkeypatch: pytest.Monkey
         world, np.random.default_rng(0).random((world.num_keys, world.num_choices, 16)) < 0.5
     )
     monkeypatch.setattr(value, "KEYED_DIRECT", 0)
-    iterated = value.evaluate(world, policy)
+    iterated = value.value_of(world, policy)
     monkeypatch.setattr(value, "KEYED_DIRECT", 10**6)
-    exact = value.evaluate(world, policy)
+    exact = value.value_of(world, policy)
     assert iterated.aihtr == pytest.approx(exact.aihtr, rel=1e-11)
     assert exact.error == 0
     assert 0 < iterated.error < 1e-9

@@ -19,7 +19,7 @@ from tests.typed import ENVIRONMENT
 from trackmdp.app.cli import main
 from trackmdp.policies import saved
 from trackmdp.solvers import bounds
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.evaluate import evaluate
 
 
 def read(folder: Path, name: str) -> dict[str, Any]:

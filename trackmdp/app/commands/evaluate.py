@@ -34,12 +34,12 @@ from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.reports.held_out import recorded_page
 from trackmdp.solvers import bounds
+from trackmdp.solvers.evaluate import evaluate, group_rule
 from trackmdp.solvers.evaluation import figures
 from trackmdp.solvers.group_bounds import upper_bound
 from trackmdp.solvers.group_figures import with_ends
 from trackmdp.solvers.group_value import evaluate_group
 from trackmdp.solvers.solve import baseline_policy
-from trackmdp.solvers.value import evaluate, group_rule
 from trackmdp.training.devices import make_device
 from trackmdp.training.display import make_console, show_held_out, table, with_interval
 from trackmdp.training.evaluator import CELL_ALONE, HeldOutEvaluator, make_evaluator

@@ -9,7 +9,7 @@ import torch
 from trackmdp.config import ExportConfig
 from trackmdp.policies.export import export
 from trackmdp.policies.saved import sets_name, write_sets
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.value import value_of
 from trackmdp.training.display import make_console
 from trackmdp.training.run import trained_alone
 
@@ -27,6 +27,6 @@ def run(cfg: ExportConfig, folder: Path) -> None:
         write_sets(folder, policy)
     else:
         file = folder / f"policy.{cfg.format}"
-        value = evaluate(world, policy).value if cfg.format == "geojson" else None
+        value = value_of(world, policy).value if cfg.format == "geojson" else None
         export(policy, file, value=value, label=subject)
     make_console(cfg.quiet).print(f"{subject} -> {file}")

@@ -22,7 +22,7 @@ from trackmdp.solvers.linear import DIRECT_CELLS
 from trackmdp.solvers.partition import narrow_halo
 from trackmdp.solvers.solution import SearchProgress, Solution
 from trackmdp.solvers.solve import run_solver, solve_group
-from trackmdp.solvers.value import evaluate
+from trackmdp.solvers.value import value_of
 from trackmdp.training.display import make_console, reporting, table
 from trackmdp.world.group import Group
 from trackmdp.world.model import World
@@ -121,7 +121,7 @@ def _show(
     found = {solution.title if name == "optimal" else name: solution.evaluation}
     # Where it senses little it is a matter of minutes on a large grid; `evaluate baseline=qmdp` values it there.
     if world.num_cells <= DIRECT_CELLS:
-        found["Q_MDP"] = evaluate(world, rules.qmdp(averaged(world)))
+        found["Q_MDP"] = value_of(world, rules.qmdp(averaged(world)))
     rows = [
         [
             name,
@@ -162,7 +162,7 @@ def _on_average(
         own_folder(folder / "mean_budget")
         own_folder(place := folder / "mean_budget" / f"{number}")
         write_sets(place, corner.table)
-        value += weight * evaluate(world, corner.table, per_cell=False).aihtr
+        value += weight * value_of(world, corner.table, per_cell=False).aihtr
         parts.append({"probability": weight, "price": corner.price, "sensors": corner.sensors})
     upper = max(value, found.worth(most, price))
     own = {"sensors": most, "binding": True, "lower": value, "upper": upper, "parts": parts}

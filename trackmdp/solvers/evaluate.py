@@ -1,0 +1,100 @@
+"""`tm.evaluate`: the figures of any policy, of one target or of several, with or without false alarms."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, overload
+
+from trackmdp.errors import UserError
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers import value
+from trackmdp.solvers.evaluation import Evaluation
+from trackmdp.solvers.false_alarms import believed
+from trackmdp.solvers.group_figures import GroupEvaluation
+from trackmdp.solvers.group_value import evaluate_group
+from trackmdp.solvers.merging import Rule, make_rule
+from trackmdp.solvers.solve import named_policy
+from trackmdp.world.group import Group
+from trackmdp.world.model import Array, BoolArray
+from trackmdp.world.tracks import Problem, check_problem
+
+if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its sets
+    from trackmdp.policies.policy import PolicyLike
+
+
+@overload
+def evaluate(
+    problem: Problem,
+    policy: PolicyLike | Array | BoolArray,
+    *,
+    guess: Array | None = ...,
+    false_alarm: float = ...,
+    per_cell: bool = ...,
+) -> Evaluation: ...
+@overload
+def evaluate(
+    problem: Group, policy: PolicyLike, *, merge: str = ..., width: float = ..., seed: int = ...
+) -> GroupEvaluation: ...
+
+
+def evaluate(
+    problem: Problem | Group,
+    policy: PolicyLike | Array | BoolArray,
+    *,
+    guess: Array | None = None,
+    false_alarm: float = 0.0,
+    per_cell: bool = True,
+    **of_group: Any,
+) -> Evaluation | GroupEvaluation:
+    """The figures of `policy`: exact on a `World`, from a replay on the held-out tracks of a `Recorded`.
+
+    Args:
+        problem: a `World`, whose episodes end by the target's exit or after `max_steps`; `Recorded` tracks; or a
+            `Group` of targets, for which a policy of a single one is merged, and simulated unless the grid is tiny.
+        policy: a `Policy` or its table, or the same dense, `[M, t_max + 1, M]`; a TensorDict module or a function
+            that does not draw (`Policy.from_function`); a `Run`, a `Solution`, a model of Stable-Baselines3; or the
+            name of a baseline.
+        guess: `[M]`, where the solve begins on a grid too large to factorise, such as the clocked bound.
+        false_alarm: p_f, with which a sensor that is on reports the target in a step in which it is not there; the
+            policy takes each report for the truth (`trackmdp.solvers.false_alarms`).
+        per_cell: whether detections, sensors and safe actions are wanted of each start cell as well, which takes half
+            as long again on a grid too large to factorise (a smaller one has them for nothing).
+        **of_group: of a `Group` alone: `merge`, "gains" or "union"; `width`, half of the 95 % interval of the reward
+            per step that is wanted, .005; and `seed` of the targets.
+
+    Raises:
+        UserError: the policy draws at random with unknown probabilities, or is for another grid.
+    """
+    if isinstance(problem, Group):
+        return _of_group(problem, policy, **of_group)
+    check_problem(problem, "evaluate")
+    if of_group:
+        raise UserError(f"{min(of_group)}: an option of several targets, expected none with one")
+    table = _table(problem, policy)
+    if false_alarm:
+        value.check_revealed(problem.motion, table)
+        return believed(problem, table, false_alarm)
+    return value.value_of(problem, table, guess=guess, per_cell=per_cell)
+
+
+def _of_group(
+    group: Group, policy: Any, *, merge: str = "gains", width: float = 0.005, seed: int = 0
+) -> GroupEvaluation:
+    """See `evaluate`."""
+    return evaluate_group(group_rule(group, policy, merge), width=width, seed=seed)
+
+
+def group_rule(group: Group, policy: Any, merge: str = "gains") -> Rule:
+    """A policy for several targets: itself, or the merged plans of single ones."""
+    if isinstance(policy, Rule):
+        return policy.within(group)
+    if (tables := getattr(policy, "tables", None)) is None:
+        if isinstance(held := getattr(policy, "policy", None), Rule):
+            return held.within(group)
+        tables = [_table(world, policy) for world in group.kinds]
+    return make_rule(group, tables, merge)
+
+
+def _table(problem: Problem, policy: PolicyLike | Array | BoolArray) -> PolicyTable:
+    """The table of a policy in any form; a name is that of a baseline."""
+    made = named_policy(problem, policy) if isinstance(policy, str) else policy
+    return value.as_table(problem, made)
