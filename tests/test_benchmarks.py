@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benchmarks import clock, spreading, train, words
+from benchmarks import clock, spreading, train, values, words
+from benchmarks.drawn import KINDS
 
 import trackmdp as tm
 from tests.helpers import ALGORITHMS
@@ -107,6 +108,43 @@ def test_commands_are_measured_beside_those_of_another_checkout(tmp_path: Path) 
     ways = measure("sweep", "grid.size=3", "runs=2")
     assert [row["way"] for row in ways] == ["one command each", "one sweep", "one sweep, joblib"]
     assert ways[0]["times_faster"] == 1.0
+
+
+def test_figures_of_drawn_worlds_are_compared_with_those_of_another_checkout(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    here = str(Path(__file__).parents[1])
+
+    def printed(place: str, count: int, seed: int) -> list[Row]:
+        off = 0.5 if place == "" else 0.0
+        solved = {"lower": 8.0 - off, "upper": 8.0 + off / 4, "certified": off == 0}
+        plain = {"kind": "plain", "exact": [0.1, 0.2 + off]} | solved
+        return [plain, {"kind": "max_steps", "exact": [count, seed + off]}]
+
+    monkeypatch.setattr(values, "HERE", "")
+    monkeypatch.setattr(values, "_printed", printed)
+    plain, cut = measure("values", f"beside={here}", "count=9", "seed=2")
+    # .5 of .2 counts as .5 of 1, of 2 as a quarter, of 8 as a sixteenth
+    assert plain == {
+        "kind": "plain",
+        "worlds": 1,
+        "exact": pytest.approx(0.5),
+        "lower": -0.0625,
+        "upper": 0.015625,
+        "certified": 0,
+        "certified_beside": 1,
+    }
+    assert (cut["exact"], cut["lower"], cut["certified"]) == (0.25, None, 0)
+    with pytest.raises(UserError, match="grid"):
+        measure("values", f"beside={here}", "grid.size=3")
+
+
+@pytest.mark.slow
+def test_the_same_worlds_are_drawn_again() -> None:
+    rows = measure("values", f"beside={Path(__file__).parents[1]}", "count=8")
+    assert [row["kind"] for row in rows] == list(KINDS)
+    assert all(row["exact"] == 0 == (row["lower"] or 0) for row in rows)
+    assert sum(row["certified"] for row in rows) >= 4
 
 
 def test_a_process_is_measured_from_start_to_end(tmp_path: Path) -> None:
