@@ -26,6 +26,7 @@ from trackmdp.policies.policy import Policy
 from trackmdp.seeding import derive
 from trackmdp.world.dynamics import Dynamics
 from trackmdp.world.env import TrackEnv
+from trackmdp.world.group import Group
 from trackmdp.world.model import World
 from trackmdp.world.outcomes import Costs
 from trackmdp.world.paths import path_sampler
@@ -298,6 +299,21 @@ def test_a_belief_within_the_tolerance_passes() -> None:
 def test_a_number_of_episodes_that_is_none_is_refused(episodes: Any) -> None:
     with pytest.raises(UserError, match=f"episodes={episodes}"):
         simulate(WORLD, policy(), episodes)
+
+
+@pytest.mark.parametrize("problem", [WORLD, Group([WORLD, WORLD])])
+def test_episodes_that_do_not_fit_are_refused_before_any_is_kept(problem: Any) -> None:
+    with pytest.raises(UserError, match=r"episodes=1000000000 need about [0-9.,]+ GiB"):
+        simulate(problem, "none", 10**9)
+
+
+def test_the_size_of_episodes_is_that_of_their_arrays() -> None:
+    two = simulate(Group([WORLD, WORLD]), "none", 2)
+    names = ("start", "misses", "action", "target", "located", "reward")
+    assert two.nbytes == sum(getattr(each, name).nbytes for each in two for name in names)
+    one = simulate(WORLD, "none", 9)
+    # Misses, target, sensors, reward of four bytes, located and truncated of one; start, its mode, and where it begins.
+    assert one.nbytes == 18 * len(one.target) + 8 * (9 + 9 + 10)
 
 
 def test_a_seed_that_is_no_whole_number_is_refused() -> None:

@@ -91,6 +91,16 @@ def test_without_latitude_and_longitude_there_is_no_map(
         tm.export(tm.Policy.none(world), tmp_path / "a.geojson")
 
 
+def test_the_command_refuses_before_it_values_the_policy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = ["grid.size=3", "algo.total_frames=2000", "algo.frames_per_batch=1000", "algo.envs=50"]
+    assert main(["train", *few, "quiet=true", f"hydra.run.dir={tmp_path}"]) == 0
+    monkeypatch.setattr("trackmdp.app.commands.export.value_of", None)  # fails where it is called
+    assert main(["export", f"run={tmp_path}", "format=geojson"]) == 2
+    assert "no latitude and longitude" in capsys.readouterr().err
+
+
 def test_what_cannot_be_exported_is_one_line(world: tm.World, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="draws its sets"):
         map_features(tm.Policy.random_k(world, 2))

@@ -127,6 +127,11 @@ class Episodes(Showing, Sequence[Episode]):
             return [self._episode(number) for number in range(len(self))[which]]
         return self._episode(range(len(self))[which])
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all columns."""
+        return sum(getattr(column, "nbytes", 0) for column in vars(self).values())
+
     def card(self) -> Card:
         """Number of episodes and steps, and their figures with standard errors."""
         problem = self.problem

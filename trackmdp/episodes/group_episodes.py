@@ -55,6 +55,12 @@ class GroupEpisodes(Showing, Sequence[GroupEpisode]):
     def __getitem__(self, which: int | slice) -> GroupEpisode | list[GroupEpisode]:
         return self._made[which]
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays of all episodes."""
+        columns = (column for each in self._made for column in vars(each).values())
+        return sum(getattr(column, "nbytes", 0) for column in columns)
+
     def card(self) -> Card:
         """Number of episodes and targets, and their figures with intervals."""
         task, steps = self.problem.task, sum(map(len, self._made))

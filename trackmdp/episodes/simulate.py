@@ -6,7 +6,7 @@ The log, the web page, the picture and the simulated figures of an evaluation ar
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, overload
+from typing import Any, cast, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,7 @@ from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.episode_draws import Draws
 from trackmdp.episodes.group_episodes import GroupEpisodes
 from trackmdp.errors import UserError
+from trackmdp.machine import free_bytes, gib
 from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import PolicyLike
 from trackmdp.seeding import derive, preserved_global_rng
@@ -83,13 +84,38 @@ def simulate(
     if not isinstance(episodes, (int, np.integer)) or episodes < 0:
         raise UserError(f"simulate: episodes={episodes}, expected an integer >= 0")
     if isinstance(problem, Group):
-        rule = group_rule(problem, policy, **of_group)
-        return GroupEpisodes(rule, episode_seeds(seed, episodes, *names))
-    if of_group:
+        policy = group_rule(problem, policy, **of_group)
+    elif of_group:
         raise UserError(f"{min(of_group)}: an option of several targets, expected none with one")
-    if isinstance(policy, str):
+    elif isinstance(policy, str):
         policy = named_policy(problem, policy)
-    return resimulate(problem, policy, episode_seeds(seed, episodes, *names))
+
+    def first(count: int) -> Any:
+        return resimulate(cast(Any, problem), policy, episode_seeds(seed, count, *names))
+
+    if episodes > _MANY:
+        _check_room(episodes, first(_TRIED))
+    made: Episodes | GroupEpisodes = first(episodes)
+    return made
+
+
+_MANY, _TRIED = 2**16, 64
+"""Episodes from which on the memory is looked at first; and simulated for that."""
+_COPIES, _SEED = 2, 44
+"""Times that the steps are held while their parts are joined; bytes of an episode's seed."""
+
+
+def _check_room(episodes: int, tried: Episodes | GroupEpisodes) -> None:
+    """See that many episodes fit into free memory, by the size of a few.
+
+    Raises:
+        UserError: they do not fit.
+    """
+    needed, free = episodes * (_COPIES * tried.nbytes / len(tried) + _SEED), free_bytes()
+    if needed > free:
+        raise UserError(
+            f"simulate: episodes={episodes} need about {gib(needed)}, {gib(free)} are available"
+        )
 
 
 def episode_seeds(seed: int, episodes: int, *names: str | int) -> list[int]:

@@ -11,6 +11,7 @@ from trackmdp.errors import UserError
 from trackmdp.policies.saved import LISTED_CELLS
 from trackmdp.policies.table import PolicyTable
 from trackmdp.world.model import Array
+from trackmdp.world.place import Place
 
 
 def map_features(policy: PolicyTable, value: Array | None = None) -> dict[str, Any]:
@@ -25,21 +26,9 @@ def map_features(policy: PolicyTable, value: Array | None = None) -> dict[str, A
         value: `[M]` V(x); null where it is nan, or not given.
 
     Raises:
-        UserError: the place of the grid is not known in latitude and longitude, the policy draws its sets, or the
-            grid is too large for a file of text.
+        UserError: see `checked_place`.
     """
-    task, place = policy.task, policy.task.place
-    if place is None or place.crs is None:
-        raise UserError(
-            "geojson: the grid has no latitude and longitude, expected positions as lat, lon, or grid.cell, "
-            "grid.origin and grid.crs"
-        )
-    if not policy.deterministic:
-        raise UserError("geojson: the policy draws its sets, expected a deterministic one")
-    if task.num_cells > LISTED_CELLS:
-        raise UserError(
-            f"geojson: {task.num_cells:,} cells, expected at most {LISTED_CELLS:,}; format=sets takes more"
-        )
+    task, place = policy.task, checked_place(policy)
     keys = task.keys.start(np.arange(task.num_cells), 0)
     features = []
     for cell, key in enumerate(keys.tolist()):
@@ -54,3 +43,25 @@ def map_features(policy: PolicyTable, value: Array | None = None) -> dict[str, A
         square = {"type": "Polygon", "coordinates": [[*corners, corners[0]]]}
         features.append({"type": "Feature", "id": cell, "geometry": square, "properties": about})
     return {"type": "FeatureCollection", "features": features}
+
+
+def checked_place(policy: PolicyTable) -> Place:
+    """Where the grid of a policy is on the map.
+
+    Raises:
+        UserError: it is not known in latitude and longitude, the policy draws its sets, or the grid is too large for a
+            file of text.
+    """
+    place, cells = policy.task.place, policy.task.num_cells
+    if place is None or place.crs is None:
+        raise UserError(
+            "geojson: the grid has no latitude and longitude, expected positions as lat, lon, or grid.cell, "
+            "grid.origin and grid.crs"
+        )
+    if not policy.deterministic:
+        raise UserError("geojson: the policy draws its sets, expected a deterministic one")
+    if cells > LISTED_CELLS:
+        raise UserError(
+            f"geojson: {cells:,} cells, expected at most {LISTED_CELLS:,}; format=sets takes more"
+        )
+    return place

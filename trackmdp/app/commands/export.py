@@ -8,6 +8,7 @@ import torch
 
 from trackmdp.config import ExportConfig
 from trackmdp.policies.export import export
+from trackmdp.policies.geojson import checked_place
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.solvers.value import value_of
 from trackmdp.training.display import make_console
@@ -27,6 +28,9 @@ def run(cfg: ExportConfig, folder: Path) -> None:
         write_sets(folder, policy)
     else:
         file = folder / f"policy.{cfg.format}"
-        value = value_of(world, policy).value if cfg.format == "geojson" else None
+        value = None
+        if cfg.format == "geojson":
+            checked_place(policy)  # before the values, which take long on a large grid
+            value = value_of(world, policy).value
         export(policy, file, value=value, label=subject)
     make_console(cfg.quiet).print(f"{subject} -> {file}")
