@@ -11,6 +11,7 @@ import pytest
 import torch
 from scipy import sparse
 
+import trackmdp as tm
 from tests.helpers import small_world, train_config
 from trackmdp.app.commands import train
 from trackmdp.errors import UserError
@@ -169,20 +170,33 @@ def test_saving_replaces_the_file_whole(tmp_path: Path, monkeypatch: pytest.Monk
     assert Policy.load(tmp_path / "policy.npz").probability == 1.0
 
 
-@pytest.mark.parametrize("listed", [20_000, 8])
+def test_sets_of_all_sensors_are_not_listed_on_a_grid_of_some_size(tmp_path: Path) -> None:
+    large, small = (Policy.all_on(small_world(side, t_max=1)) for side in (40, 5))
+    assert (saved.listable(large), saved.listable(small)) == (False, True)
+    with pytest.raises(UserError, match="too many sets"):
+        tm.export(large, tmp_path / "a.json")
+
+
+@pytest.mark.parametrize(
+    ("limit", "listed"),
+    [("CELLS", 9), ("CELLS", 8), ("NUMBERS", 18 + 54), ("NUMBERS", 18 + 53)],
+)
 def test_sets_are_read_back_from_a_list_and_from_an_array_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, listed: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, listed: int
 ) -> None:
-    world = small_world(3, t_max=1)
-    policy, value = rules.qmdp(world), np.arange(9.0)
-    monkeypatch.setattr(saved, "LISTED_CELLS", listed)
+    world = small_world(3, t_max=1)  # 9 cells, two sets each
+    on = np.zeros((9, 2, 9))
+    on[..., :3] = 1  # three sensors in each of 18 sets
+    policy, value = Policy.from_dense(world, on), np.arange(9.0)
+    monkeypatch.setattr(saved, f"LISTED_{limit}", listed)
     named = saved.write_sets(tmp_path, policy, value=value)
-    assert [file.name for file in tmp_path.iterdir()] == [saved.sets_name(world)]
-    assert named["value"] == (value.tolist() if listed > 9 else "sets.npz")
-    found = saved.read_sets(world, tmp_path / saved.sets_name(world))
+    name = "sets.json" if listed in (9, 18 + 54) else "sets.npz"
+    assert [file.name for file in tmp_path.iterdir()] == [name]
+    assert named["value"] == (value.tolist() if name == "sets.json" else "sets.npz")
+    found = saved.read_sets(world, tmp_path / name)
     assert np.array_equal(found.dense(), policy.dense())
     with pytest.raises(UserError, match=r"; expected (\[2, 2\]|2 x 2)"):
-        saved.read_sets(small_world(2, t_max=1), tmp_path / saved.sets_name(world))
+        saved.read_sets(small_world(2, t_max=1), tmp_path / name)
 
 
 @pytest.mark.parametrize(

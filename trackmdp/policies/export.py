@@ -20,6 +20,7 @@ from trackmdp.durable import write_bytes
 from trackmdp.errors import UserError, require
 from trackmdp.policies.forms import adapted
 from trackmdp.policies.geojson import map_features
+from trackmdp.policies.saved import listable
 from trackmdp.policies.table import PolicyTable
 from trackmdp.world.model import Array, BoolArray, Task
 
@@ -129,6 +130,10 @@ def to_onnx(policy: PolicyTable, _: Array | None, about: dict[str, str]) -> byte
 
 
 def _to_sets(policy: PolicyTable, *_: object) -> bytes:
+    if not listable(policy):
+        raise UserError(
+            "export: too many sets for a .json; `trackmdp export format=sets` writes them as .npz"
+        )
     return json.dumps(policy.as_lists()).encode()
 
 

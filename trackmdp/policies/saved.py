@@ -21,8 +21,8 @@ from trackmdp.world.files import npz_bytes, whole_csr
 from trackmdp.world.model import Array, Task
 from trackmdp.world.problem_file import as_arrays, from_arrays
 
-LISTED_CELLS = 20_000
-"""Cells up to which sets and values are written as JSON."""
+LISTED_CELLS, LISTED_NUMBERS = 20_000, 2**21
+"""Cells, and sets and sensors in them, up to which sets are written as JSON; writing a number takes 130 bytes."""
 
 _TASK = "task_"
 """Begins the names of the arrays of a policy's task (`trackmdp.world.problem_file`)."""
@@ -94,18 +94,27 @@ def unpacked_policy(task: Task, content: Mapping[str, npt.NDArray[Any]]) -> Poli
     return PolicyTable(task, sets, k=k)
 
 
-def sets_name(task: Task) -> str:
-    """`sets.json`, or on a grid too large for that `sets.npz`."""
-    return "sets.json" if task.num_cells <= LISTED_CELLS else "sets.npz"
+def listable(policy: PolicyTable) -> bool:
+    """Whether the sets are few enough to be written as JSON; always on, 40 x 40 sensors are too many."""
+    task = policy.task
+    rows = task.num_keys * task.num_choices
+    every = task.total_sensors if policy.probability else 0
+    on = rows * every if policy.sets is None else policy.sets.nnz
+    return task.num_cells <= LISTED_CELLS and rows + on <= LISTED_NUMBERS
+
+
+def sets_name(policy: PolicyTable) -> str:
+    """`sets.json`, or where the sets are too many for that `sets.npz`."""
+    return "sets.json" if listable(policy) else "sets.npz"
 
 
 def write_sets(folder: Path, policy: PolicyTable, **arrays: Array) -> dict[str, Any]:
     """Write the sets of a policy, and return `arrays` as a report in JSON has them.
 
-    Up to `LISTED_CELLS` cells the sets go to `sets.json`, unless they are drawn at random, and the arrays are returned
-    as lists. Above, both go to `sets.npz`, as `load_policy` reads it, and in place of each array its file is named.
+    Where they are `listable` the sets go to `sets.json`, unless they are drawn at random, and the arrays are returned
+    as lists. Else both go to `sets.npz`, as `load_policy` reads it, and in place of each array its file is named.
     """
-    file = folder / sets_name(policy.task)
+    file = folder / sets_name(policy)
     if file.suffix == ".npz":
         save_policy(file, policy, **arrays)
         return dict.fromkeys(arrays, file.name)

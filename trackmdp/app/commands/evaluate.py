@@ -131,7 +131,7 @@ def _exact(
     console.print(_compared(subject, report, simulation))
     source = "run's bracket" if proved else "clocked"
     console.print(f"upper bound ({source}) {evaluator.upper:,.4f}; {score.regret}")
-    console.print(f"results in {folder}, sets in {sets_name(world)}")
+    console.print(f"results in {folder}, sets in {sets_name(policy)}")
     _log(cfg, episodes, subject, folder, console)
     return score.evaluation.aihtr
 

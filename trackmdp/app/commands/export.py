@@ -24,7 +24,7 @@ def run(cfg: ExportConfig, folder: Path) -> None:
     best = cfg.checkpoint == "best"
     world, policy, subject = trained_alone(cfg.run, torch.device("cpu"), best=best)
     if cfg.format == "sets":
-        file = folder / sets_name(policy.task)
+        file = folder / sets_name(policy)
         write_sets(folder, policy)
     else:
         file = folder / f"policy.{cfg.format}"

@@ -156,7 +156,7 @@ def _show(console: Console, found: Tradeoff, folder: Path) -> None:
     console.print(
         f"{ended}: no policy is more than {found.gap:.2g} above the corners and their edges; "
         f"{len(found.slopes)} prices, {found.seconds:.1f} s; results in {folder}, sets in "
-        f"corners/NUMBER/{sets_name(found.corners[0].table.task)}"
+        f"corners/NUMBER/{sets_name(found.corners[0].table)}"
     )
 
 

@@ -92,7 +92,7 @@ def _several(cfg: SolveConfig, world: World, folder: Path, at: Console) -> float
     proof = "a lower end" if found.lower is not None else "no proved lower end"
     at.print(
         f"separate trackers are {proof} of the bracket, {gap:.2g} per step wide; {found.seconds:.1f} s; results in "
-        f"{folder}, sets of one target in {sets_name(world)}; evaluate baseline=optimal values them merged"
+        f"{folder}, sets of one target in {sets_name(single.table)}; evaluate baseline=optimal values them merged"
     )
     if single.interrupted:
         raise KeyboardInterrupt
@@ -143,7 +143,8 @@ def _show(
     regret = max(regret_per_step(solution.upper, solution.evaluation), 0.0)
     at.print(
         f"{solution.ended}: bracket {solution.lower:,.6f} ... {solution.upper:,.6f}, {regret:.2g} per step, after "
-        f"{solution.seconds:.1f} s and {solution.nodes:,} nodes; results in {folder}, sets in {sets_name(world)}"
+        f"{solution.seconds:.1f} s and {solution.nodes:,} nodes; results in {folder}, sets in "
+        f"{sets_name(solution.table)}"
     )
 
 
