@@ -49,6 +49,16 @@ class Recording(Carded):
         """`[T]` the cell in which the target was located by the step, -1 if in none; of K targets `[T, K]`."""
         return np.where(self.located, self.target, -1)
 
+    @property
+    def last_cell(self) -> Integers:
+        """`[T]` cell of the last detection before the step, x_{l(k)}; of K targets `[T, K]`."""
+        return self._last_cells[:-1]
+
+    @cached_property
+    def _last_cells(self) -> Integers:
+        """`[T + 1]`, also after the last step."""
+        return last_cells(self.start, self.target, self.located)
+
     @cached_property
     def returns(self) -> npt.NDArray[np.float64]:
         """`[T]` reward summed up to and with the step."""
@@ -124,11 +134,6 @@ class Episode(Recording):
         facts["sensors per step"] = decimal(float(self.action.sum(1).mean()))
         return Card(f"Episode: number {self.number}, seed {self.seed}", facts)
 
-    @cached_property
-    def last_cell(self) -> Integers:
-        """`[T]` cell of the last detection before the step, x_{l(k)}."""
-        return last_cells(self.start, self.target, self.located)[:-1]
-
     @property
     def complete(self) -> bool:
         """See `Recording`."""
@@ -160,7 +165,7 @@ class Episode(Recording):
         over = self.located[-1] or self.terminated
         misses = np.append(self.misses, 0 if over else min(self.misses[-1] + 1, task.t_max + 1))
         states = {
-            "last_cell": last_cells(self.start, self.target, self.located),
+            "last_cell": self._last_cells,
             "steps_since_detection": misses,
             "action_history": _history(action, misses, self.located, task.t_max),
         }
@@ -192,15 +197,15 @@ def _history(action: BoolArray, misses: Integers, located: BoolArray, t_max: int
     return action[np.where(filled, steps, 0)] & filled[..., None]
 
 
-def last_cells(start: int, target: Integers, located: BoolArray) -> Integers:
-    """`[T + 1]` cell of the last detection before each step of an episode, and after the last one.
+def last_cells(start: Any, target: Integers, located: BoolArray) -> Integers:
+    """`[T + 1]` cell of the last detection before each step of an episode, and after the last one; or `[T + 1, K]`.
 
     With detections at steps 1 and 3 of five, `latest` is -1 -1 1 1 3 3.
     """
-    found = np.where(located, np.arange(len(target)), -1)
+    found = np.where(located.T, np.arange(len(target)), -1).T
     # Shifted by one: a detection is known from the next step on.
-    latest = np.concatenate([[-1], np.maximum.accumulate(found)])
-    return np.where(latest < 0, start, target[latest])
+    latest = np.insert(np.maximum.accumulate(found), 0, -1, axis=0)
+    return np.where(latest < 0, start, np.take_along_axis(target, latest, axis=0))
 
 
 def ends(steps: int, terminated: bool, truncated: bool) -> dict[str, Any]:

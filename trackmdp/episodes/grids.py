@@ -8,13 +8,13 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from trackmdp.episodes.episode import Episode, Floats
-from trackmdp.episodes.schema import time_of
+from trackmdp.episodes.schema import clock_of, json_bytes
 from trackmdp.world.model import BoolArray
 
 WHOLE_CELLS = 64 * 64
@@ -23,6 +23,9 @@ WHOLE_CELLS = 64 * 64
 PART, _STEP = 25, 9
 """Rows and columns that a viewer shows of a larger grid, and how far that part moves at once: it stays where it is
 while the target does not leave 9 x 9 cells."""
+
+Box: TypeAlias = tuple[int, int, int, int]
+"""Top, bottom, left and right, ends excluded."""
 
 _CELL = np.dtype([("belief", "<f4"), ("policy", "<f4")])
 ACTIVE, _TARGET = np.dtype([("active", "u1")]), np.dtype([("target", "u1")])
@@ -41,7 +44,7 @@ def constant(cell: np.dtype[Any], side: float = 1) -> bytes:
             for name, (kind, offset, *_) in fields
         ],
     }
-    return json.dumps(said, separators=(",", ":")).encode()[1:-1]
+    return json_bytes(said)[1:-1]
 
 
 _GRID_SAYS, _ACTIVE_SAYS, _TARGET_SAYS = (
@@ -72,20 +75,11 @@ def grid_messages(
     exited = (episode.target == rows * columns).astype(int).tolist()
     at = np.stack(np.divmod(episode.target % (rows * columns), columns), axis=1).tolist()
     boxes = zip(boxes_of(used), boxes_of(active), at, _parts(episode, size), strict=True)
-    for t, (
-        (top, bottom, left, right),
-        (first, last, start, stop),
-        (row, column),
-        (y, x),
-    ) in enumerate(boxes):
+    for t, (box, active_box, (row, column), (y, x)) in enumerate(boxes):
         stamp = stamp_of(first_tick + t)
         yield {
-            "/grid": grid_text(
-                stamp, _GRID_SAYS, cells[t, top:bottom, left:right], left, rows - bottom, 0
-            ),
-            "/active": grid_text(
-                stamp, _ACTIVE_SAYS, sensed[t, first:last, start:stop], start, rows - last, 0.01
-            ),
+            "/grid": boxed(stamp, _GRID_SAYS, cells[t], box, 0),
+            "/active": boxed(stamp, _ACTIVE_SAYS, sensed[t], active_box, 0.01),
             # half as wide as its cell, so that the layers beneath it show: in column 3 from x = 3.25 to 3.75
             "/target": grid_text(
                 stamp, _TARGET_SAYS, _DOT[exited[t]], column + 0.25, rows - row - 0.75, 0.02
@@ -96,8 +90,7 @@ def grid_messages(
 
 def stamp_of(tick: int) -> bytes:
     """The begin of a message of a tick."""
-    seconds, rest = divmod(time_of(tick), 1_000_000_000)
-    return b'{"timestamp":{"sec":%d,"nsec":%d}' % (seconds, rest)
+    return json_bytes({"timestamp": clock_of(tick)})[:-1]
 
 
 def part_text(stamp: bytes, x: float, y: float) -> bytes:
@@ -122,8 +115,8 @@ def _parts(episode: Episode, size: tuple[int, int]) -> list[list[float]]:
     return np.clip(middles, half, np.array(size) - half).tolist()
 
 
-def boxes_of(used: BoolArray) -> Iterator[tuple[int, int, int, int]]:
-    """Of each step the smallest (top, bottom, left, right), ends excluded, around what is `used` `[T, R, C]`.
+def boxes_of(used: BoolArray) -> Iterator[Box]:
+    """Of each step the smallest box around what is `used` `[T, R, C]`.
 
     Where nothing is, the first cell.
     """
@@ -134,6 +127,12 @@ def boxes_of(used: BoolArray) -> Iterator[tuple[int, int, int, int]]:
         # argmax is the place of the first True: lines 0 1 1 0 0 begin at 1 and, 0 0 1 1 0 backwards, end at 5 - 2 = 3
         ends += [lines.argmax(1), np.where(some, lines.shape[1] - lines[:, ::-1].argmax(1), 1)]
     return zip(*(each.tolist() for each in ends), strict=True)
+
+
+def boxed(stamp: bytes, says: bytes, cells: npt.NDArray[Any], box: Box, z: float) -> bytes:
+    """The message of the part `box` of a layer `[R, C]`."""
+    top, bottom, left, right = box
+    return grid_text(stamp, says, cells[top:bottom, left:right], left, len(cells) - bottom, z)
 
 
 def grid_text(

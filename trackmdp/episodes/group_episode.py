@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ import numpy.typing as npt
 from scipy import sparse
 from tensordict import TensorDict
 
-from trackmdp.episodes.episode import Episode, Floats, Integers, Recording, ends, last_cells
+from trackmdp.episodes.episode import Episode, Floats, Integers, Recording, ends
 from trackmdp.notebook.card import Card, decimal
 from trackmdp.world.model import BoolArray, Task
 
@@ -60,17 +59,6 @@ class GroupEpisode(Recording):
         facts["located"] = f"{int(self.located.sum()):,} times"
         facts["sensors per step"] = decimal(float(self.action.sum(1).mean()))
         return Card(f"Episode: number {self.number}, seed {self.seed}", facts)
-
-    @cached_property
-    def last_cell(self) -> Integers:
-        """`[T, K]` cell of each target's last detection before the step."""
-        return self._last_cells[:-1]
-
-    @cached_property
-    def _last_cells(self) -> Integers:
-        """`[T + 1, K]`, also after the last step."""
-        columns = zip(self.start.tolist(), self.target.T, self.located.T, strict=True)
-        return np.stack([last_cells(*column) for column in columns], axis=1)
 
     @property
     def complete(self) -> bool:

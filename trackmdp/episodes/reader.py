@@ -107,20 +107,15 @@ class EpisodeReader:
     def read(self, number: int) -> Any:
         """Episode `number`, an `Episode`, or a `GroupEpisode` of several targets."""
         row = self.row(number)
-        mine: dict[str, list[bytes]] = {"/step": [], "/grid": []}
         with reading(self.file):
-            for topic, data in self._between(int(row["start_time"]), int(row["end_time"])):
-                mine.setdefault(topic, []).append(data)
-            return self._form.decode(row, mine)
+            return self._form.decode(row, self._around(row))
 
-    def _between(self, begin: int, end: int) -> Iterator[tuple[str, bytes]]:
-        """The messages from one log time to another; the chunk read last is kept, for the episode after."""
-        for chunk in self._container.chunks_between(begin, end):
+    def _around(self, row: dict[str, Any]) -> Iterator[Said]:
+        """The messages of the chunks with an episode; the chunk read last is kept, for the episode after."""
+        for chunk in self._container.chunks_between(int(row["start_time"]), int(row["end_time"])):
             if self._held[0] != chunk.chunk_start_offset:
                 self._held = chunk.chunk_start_offset, self._container.messages(chunk)
-            yield from (
-                (topic, data) for topic, time, data in self._held[1] if begin <= time <= end
-            )
+            yield from self._held[1]
 
     def attachment(self, name: str, sha256: str | None = None) -> bytes:
         """An attachment with its digest, by default that of `trackmdp.run`."""
@@ -132,16 +127,8 @@ class EpisodeReader:
 
     def policy_tables(self, number: int) -> list[bytes]:
         """The files of policy `number`, one for each motion; empty if it has no table."""
-        digests = self.policies[number]
-        kinds = range(max(self.run.kinds, default=0) + 1)
-        found = {
-            kind: digests[schema.table_digest(kind)]
-            for kind in kinds
-            if digests[schema.table_digest(0)]
-        }
-        return [
-            self.attachment(schema.policy_file(number, kind), each) for kind, each in found.items()
-        ]
+        tables = self.run.policy_tables(number, self.policies[number])
+        return [self.attachment(*each) for each in tables.items()]
 
     def policy(self, number: int) -> Policy | Rule:
         """Policy `number`, as it acted.

@@ -8,13 +8,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from mcap.records import Attachment, Chunk, DataEnd, Metadata
 
 from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged, Said
-from trackmdp.episodes.episode import Recording
 from trackmdp.episodes.schema import LoggedRun
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.episodes.written import form_of
@@ -102,7 +101,8 @@ def _rewrite(
                 if row["policy"] >= most:
                     break
                 _add_policies(writer, parts, row["policy"] + 1)
-                writer.add(_episode(row, held, writer.run))
+                # Messages of another episode may be held as well, one with an end that was lost.
+                writer.add(form_of(writer.run).decode(row, held))
             held.clear()
         writer = writer or _begin(file, target, parts, damaged)
     if held or schema.END not in parts.metadata:
@@ -161,24 +161,7 @@ def _add_policies(writer: EpisodeWriter, parts: _Parts, count: int) -> None:
     """Copy policies until there are `count`."""
     # One after another: the number of a policy is its place.
     for each in range(writer.policies, count):
-        facts = dict(parts.metadata[f"{schema.POLICY}.{each}"])
-        named = (schema.table_digest(kind) for kind in range(max(writer.run.kinds, default=0) + 1))
-        digests = [facts.pop(name) for name in named if name in facts]
-        tables = [
-            parts.attached(schema.policy_file(each, kind), sha256)
-            for kind, sha256 in enumerate(digests)
-            if sha256
-        ]
+        facts = parts.metadata[f"{schema.POLICY}.{each}"]
+        tables = [parts.attached(*it) for it in writer.run.policy_tables(each, facts).items()]
         writer.flush()  # as when it was recorded, so that a copy has the same bytes
         writer.copy_policy(facts, tables)
-
-
-def _episode(row: dict[str, Any], held: list[Said], run: LoggedRun) -> Recording:
-    """The episode of a row; before its messages those of another may be held, with an end that was lost."""
-    begin, end = int(row["start_time"]), int(row["end_time"])
-    mine: dict[str, list[bytes]] = {"/step": [], "/grid": []}
-    for topic, time, data in held:
-        if begin <= time <= end:
-            mine.setdefault(topic, []).append(data)
-    found: Recording = form_of(run).decode(row, mine)
-    return found

@@ -35,6 +35,12 @@ def time_of(tick: int) -> int:
     return _BASE_NS + tick * TICK_NS
 
 
+def clock_of(tick: int) -> dict[str, int]:
+    """The same as seconds and nanoseconds."""
+    seconds, rest = divmod(time_of(tick), 1_000_000_000)
+    return {"sec": seconds, "nsec": rest}
+
+
 def tick_of(log_time: int) -> int:
     """The tick of a log time."""
     return (log_time - _BASE_NS) // TICK_NS
@@ -106,6 +112,18 @@ def schemas_of_several(targets: int) -> dict[str, tuple[str, dict[str, Any]]]:
 
 MODE = {"/step": {"mode": {"type": "integer"}}, "/episode": {"start_mode": {"type": "integer"}}}
 """Topic -> further properties of its messages, in logs of targets with a mode."""
+
+
+_JSON = json.JSONEncoder(allow_nan=False, separators=(",", ":"))
+
+
+def json_bytes(content: Any) -> bytes:
+    """JSON without blanks.
+
+    Raises:
+        ValueError: a number is not finite.
+    """
+    return _JSON.encode(content).encode()
 
 
 def digest(content: bytes) -> str:
@@ -200,12 +218,20 @@ class LoggedRun:
             raise ValueError("targets of other motions than those in the file")
 
     @property
+    def motions(self) -> range:
+        """Numbers of the motions."""
+        return range(max(self.kinds, default=0) + 1)
+
+    @property
     def tables(self) -> list[str]:
         """The attachments that the log begins with."""
-        return [
-            *TABLES,
-            *(numbered(PROBLEM, kind) for kind in range(1, max(self.kinds, default=0) + 1)),
-        ]
+        return [*TABLES, *(numbered(PROBLEM, kind) for kind in self.motions[1:])]
+
+    def policy_tables(self, number: int, facts: Mapping[str, str]) -> dict[str, str]:
+        """Name -> digest of the attachments with the tables of a policy; empty where it has none."""
+        if not facts[table_digest(0)]:
+            return {}
+        return {policy_file(number, kind): facts[table_digest(kind)] for kind in self.motions}
 
     @property
     def schemas(self) -> dict[str, tuple[str, dict[str, Any]]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -106,7 +105,7 @@ class EpisodeWriter:
         self.flush()
 
     def _register(self, topic: str, name: str, description: dict[str, Any]) -> int:
-        text = json.dumps(description, separators=(",", ":")).encode()
+        text = schema.json_bytes(description)
         number = self._writer.register_schema(name, "jsonschema", text)
         return self._writer.register_channel(topic, "json", number)
 
@@ -180,7 +179,7 @@ class EpisodeWriter:
             time, sequence = time_of(place), place & 0xFFFFFFFF
             for topic, text in ({"/step": said} | layers).items():
                 add(channels[topic], time, text, time, sequence)
-        text = json.dumps(row, allow_nan=False, separators=(",", ":")).encode()
+        text = schema.json_bytes(row)
         add(channels["/episode"], time, text, time, sequence)
 
     def flush(self) -> None:
@@ -198,7 +197,7 @@ class EpisodeWriter:
 
     def finish(self) -> Path:
         """Complete the file and give it its name; returns it."""
-        index = json.dumps(self._rows, allow_nan=False, separators=(",", ":")).encode()
+        index = schema.json_bytes(self._rows)
         self.flush()
         self._attach("episodes.json", index)
         counts = {
