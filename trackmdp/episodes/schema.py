@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from trackmdp import __version__
+from trackmdp.config.several import MOST_TARGETS
 from trackmdp.errors import UserError
 from trackmdp.untrusted import decoded
 from trackmdp.world.problem_file import PROBLEM
@@ -211,7 +212,7 @@ class LoggedRun:
         self.sensors = int(said.get("sensors", self.cells))
         self.modes, self.t_max = int(said.get("modes", 0)), int(said["t_max"])
         self.kinds = tuple(map(int, said.get("targets", "").split()))
-        if any(
+        if len(self.kinds) > MOST_TARGETS or any(
             kind not in {0, *(each + 1 for each in self.kinds[:k])}
             for k, kind in enumerate(self.kinds)
         ):
