@@ -49,13 +49,14 @@ def best_of_all(group: Group) -> float:
     chain = explored(group, lambda _: sets, 10_000)
     assert chain is not None
     value: Array = np.zeros(chain.states)
-    while True:
+    for step in itertools.count(1):
         worth = chain.totals[:, 0] + chain.moves @ value
         after = np.full(chain.states, -np.inf)
         np.maximum.at(after, chain.owner, worth)
-        if np.abs(after - value).max() < 1e-11:
-            return float(after[: chain.starts].mean())
+        if np.abs(after - value).max() < 1e-11 or step == group.task.max_steps:
+            break
         value = after
+    return float(after[: chain.starts].mean())
 
 
 def check_bracket(group: Group) -> None:
@@ -88,6 +89,38 @@ def test_brute_force_lies_in_the_bracket_of_other_targets_and_longer_clocks(seed
     world = tiny(seed, t_max=1)
     other = World.of(world, tiny(seed + 100).kernel)
     check_bracket(Group([world, world if seed % 2 else other]))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("max_steps", [1, 2, 5])
+def test_brute_force_of_truncated_episodes_is_below_the_bound(seed: int, max_steps: int) -> None:
+    world = tiny(seed, max_steps=max_steps)
+    group = Group([world, World.of(world, tiny(seed + 100).kernel) if seed % 2 else world])
+    best, tables = (
+        best_of_all(group),
+        [solve(each.but(max_steps=None)).table for each in group.kinds],
+    )
+    assert best <= upper_bound(group) + 1e-9
+    for merge in ("gains", "union"):
+        rule = make_rule(group, tables, merge)
+        exact, played = evaluate_group(rule), evaluate_group(rule, episodes=3_000)
+        assert exact.exact
+        assert exact.aihtr.mean <= best + 1e-9
+        assert exact.totals[0, 5] == pytest.approx(group.expected_steps)
+        assert exact.totals[0, 1] == pytest.approx(group.target_steps)
+        assert played.totals[:, 5].max() <= max_steps
+        assert played.aihtr.low is not None
+        half = played.aihtr.mean - played.aihtr.low
+        assert abs(played.aihtr.mean - exact.aihtr.mean) < 2 * half + 1e-9
+
+
+def test_targets_that_never_leave_are_followed_for_the_steps_allowed() -> None:
+    world = World(np.full((4, 4), 0.25), 2, cost=0.1, max_steps=6)
+    group = Group([world] * 2)
+    assert group.expected_steps == 6
+    assert evaluate(group, "none", merge="union").exact
+    with pytest.raises(UserError, match="never"):
+        evaluate(group, "none")
 
 
 def test_one_target_is_todays_world() -> None:
@@ -178,7 +211,10 @@ def test_bracket_of_two_targets_on_six_by_six_is_narrow() -> None:
     ("words", "refusal"),
     [
         (["solve", "targets.count=2", "grid.window=2"], "grid.window=2: expected null"),
-        (["solve", "targets.count=2", "kernel=heading"], "kernel=heading: expected a motion"),
+        (
+            ["solve", "targets.count=2", "kernel=heading"],
+            "kernel=heading: expected one without modes",
+        ),
         (["solve", "targets.count=2", "sensor=footprint"], "sensor=footprint: expected perfect"),
         (["solve", "targets.count=2", "cost.mean_budget=1"], "cost.mean_budget=1"),
         (
@@ -216,8 +252,8 @@ def test_other_targets_and_policies_are_refused() -> None:
             Group(many)  # type: ignore[arg-type]
     with pytest.raises(UserError, match="target 1 has another grid, price or limit"):
         Group([world, world.but(t_max=1)])
-    with pytest.raises(UserError, match=r"grid.max_steps=5, expected none with several targets"):
-        Group([world.but(max_steps=5)] * 2)
+    with pytest.raises(UserError, match=r"grid.window=1, expected none with several targets"):
+        Group([world.but(window=1)] * 2)
     with pytest.raises(UserError, match="does not draw, for several targets"):
         evaluate(Group([world] * 2), Policy.random_k(world, 1))
     with pytest.raises(UserError, match="merge: an option of several targets"):

@@ -151,7 +151,7 @@ def test_one_targets_plan_is_learned_and_merged(merge: str, tmp_path: Path) -> N
         (["algo=a2c", "targets.merge=union"], "targets.merge=union: without effect with algo=a2c"),
         (["targets.count=1", "targets.merge=union"], "without effect with targets.count=1"),
         (["targets.count=1", "evaluation.width=1"], "without effect with targets.count=1"),
-        (["kernel=heading"], "kernel=heading: expected a motion model without modes"),
+        (["kernel=heading"], "kernel=heading: expected one without modes"),
     ],
 )
 def test_words_without_effect_are_refused(

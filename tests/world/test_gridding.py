@@ -381,3 +381,14 @@ def test_cells_need_no_gridding(tmp_path: Path) -> None:
         match=r"expected a file that ends with one of \.csv, \.npz, .*, or kernel\.format$",
     ):
         tm.load_tracks(tmp_path / "t.doc", 3)
+
+
+def test_tracks_begin_at_the_recordings_clock() -> None:
+    """The first report of all is at 100 s; target 1 comes 11 s later, is outside, and enters two steps on."""
+    tracks, _ = made(
+        seen((0, 100, 5, 5), (0, 110, 25, 5), (1, 111, 45, 5), (1, 131, 5, 5), (2, 104, 5, 5)),
+        max_gap=30.0,
+    )
+    assert cells(tracks) == [[3, 4, 5], [5, 4, 3], [3]]
+    assert tracks.begins is not None
+    assert tracks.begins.tolist() == [0, 4, 1]

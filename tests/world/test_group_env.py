@@ -89,6 +89,18 @@ def test_union_earns_in_the_environment_what_the_joint_chain_says() -> None:
     assert error < 0.02 * abs(expected)
 
 
+def test_episodes_are_cut_after_the_last_step_allowed() -> None:
+    env = TrackEnv(two_kinds(max_steps=3, exit_probability=0.3), 500, seed=1)
+    check_env_specs(env)
+    shown = env.rollout(3, break_when_any_done=False)["next"]
+    assert shown["step_count"].max() == 3
+    ended = shown["done"][:, :, 0].numpy()
+    truncated, left = shown["truncated"][:, :, 0], ~shown["present"].any(-1)
+    assert (truncated[:, :2].sum(), bool(truncated[:, 2].any())) == (0, True)
+    assert (shown["terminated"][:, :, 0] == left).all()
+    assert (ended == (truncated | left).numpy()).all()
+
+
 def test_a_snapshot_continues_with_the_same_draws() -> None:
     env = TrackEnv(two_kinds(detection=0.7), 4)
     env.rollout(5, break_when_any_done=False)

@@ -26,14 +26,12 @@ class TargetsConfig(NodeConfig):
             return
         # Each of these makes a single target's plan depend on more than its own cell and clock.
         with_several = f"with {key}.count={self.count}"
-        kernel = root.kernel
-        if not kernel.is_motion or kernel.hides:
-            raise refuse("kernel", kernel.name, f"a motion model without modes {with_several}")
+        if root.kernel.hides:
+            raise refuse("kernel", root.kernel.name, f"one without modes {with_several}")
         if root.sensor.name not in ("perfect", "miss", "given"):
             raise refuse("sensor", root.sensor.name, f"perfect or miss {with_several}")
         for place, value, expected in (
             ("grid.window", root.grid.window, None),
-            ("grid.max_steps", root.grid.max_steps, None),
             ("task.memory", root.task.memory, "cell"),
             ("cost.mean_budget", getattr(root.cost, "mean_budget", None), None),
             ("verify", getattr(root, "verify", False), False),
@@ -47,9 +45,9 @@ class TargetsConfig(NodeConfig):
 class MergedTargetsConfig(TargetsConfig):
     """Several targets, and how policies of single ones are put together."""
 
-    merge: str = option(
+    merge: str | None = option(
         "gains: a sensor is on where the gains of all targets together exceed its price; union: the sensors of all "
-        "targets' own sets",
+        "targets' own sets; null: gains, on recorded tracks union",
         choices=("gains", "union"),
     )
 

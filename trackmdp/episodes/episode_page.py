@@ -50,7 +50,8 @@ def _about(problem: Problem | Group, episode: Recording, seed: str) -> str:
     if isinstance(problem, Recorded):
         about[0] += " along a held-out track"
     if isinstance(problem, Group):
-        about[0] += f", {len(problem)} targets"
+        along = " along held-out tracks" if problem.recorded else ""
+        about[0] += f", {len(problem)} targets{along}"
     about[0] += f", seed {seed}" if seed else ""
     if len(episode) > MOST_STEPS:
         about.append(f"the first {MOST_STEPS:,} steps are shown")
@@ -102,7 +103,7 @@ def _of_target(episode: Episode, task: Task) -> dict[str, Any]:
     target = np.where(episode.target == task.num_cells, -1, episode.target)
     assert episode.belief is not None  # a logged episode has it
     return {
-        "start": int(episode.start),
+        "start": -1 if episode.start == task.num_cells else int(episode.start),
         "target": target[shown].tolist(),
         "located": episode.located[shown].astype(int).tolist(),
         "n": episode.misses[shown].tolist(),

@@ -24,11 +24,11 @@ class GroupEpisode(Recording):
         number: its place in the log.
         seed: all its draws derive from it, so that it replays alone.
         policy: which of the log's policies acted.
-        start: `[K]` cells in which the targets were located at the start.
+        start: `[K]` cells in which the targets were located at the start; M of one that enters later.
         misses: `[T, K]` n before the step, 0 once the target has left.
         action: `[T, S]` sensors on; none where the safe action is forced.
-        target: `[T, K]` the true cells after the move, M once a target has left the grid.
-        located: `[T, K]` whether the target was located in that cell.
+        target: `[T, K]` the true cells after the move, M before a target enters and once it has left the grid.
+        located: `[T, K]` whether the target was located in that cell, as one that enters always is.
         reward: `[T]` reward of all targets together.
         terminated: the last target left in the last step.
         truncated: the last step was the last one allowed.
@@ -95,17 +95,21 @@ class GroupEpisode(Recording):
 
     def to_tensordict(self, task: Task) -> TensorDict:
         """`[T]` steps under the keys of `TrackEnv` for several targets, the outcome of each step under `next`."""
-        left = self.target >= task.num_cells
-        gone, seen = np.append(left[:1] & False, left, axis=0), self.located
-        misses = np.append(self.misses, np.where(seen[-1] | left[-1], 0, self.misses[-1] + 1)[None])
+        gone, seen = (
+            np.append(self.start[None], self.target, axis=0) >= task.num_cells,
+            self.located,
+        )
+        misses = np.append(self.misses, np.where(seen[-1] | gone[-1], 0, self.misses[-1] + 1)[None])
         states: dict[str, npt.NDArray[Any]] = {
-            "last_cell": self._last_cells,
+            "last_cell": np.where(self._last_cells < task.num_cells, self._last_cells, 0),
             "steps_since_detection": misses.reshape(gone.shape),
             "present": ~gone,
             "action_history": self._history(task.t_max),
         }
         if not task.available.all():
             states["action_mask"] = np.broadcast_to(task.available, (len(gone), len(task.cost)))
+        if task.max_steps:
+            states["step_count"] = np.arange(len(gone))
         current = {key: value[:-1] for key, value in states.items()}
         current |= {"action": self.action, **ends(len(self), terminated=False, truncated=False)}
         following = {key: value[1:] for key, value in states.items()}

@@ -75,9 +75,11 @@ class GroupEpisodes(Showing, Sequence[GroupEpisode]):
     def figures(self) -> GroupEvaluation:
         """The policy's figures from the episodes, with 95 % intervals."""
         group = self.problem
-        totals = np.array([self._totals(each) for each in self._made])
+        totals = np.array([self._totals(each) for each in self._made]).reshape(-1, 7)
+        if group.recorded is not None:
+            return GroupEvaluation(totals, False, float(totals[:, 5].mean()), None)
         controls = group.target_steps, known_mean(self.policy)
-        return GroupEvaluation(totals.reshape(-1, 7), False, group.expected_steps, controls)
+        return GroupEvaluation(totals, False, group.expected_steps, controls)
 
     @cached_property
     def _known(self) -> Array:
@@ -86,12 +88,13 @@ class GroupEpisodes(Showing, Sequence[GroupEpisode]):
     def _totals(self, episode: GroupEpisode) -> list[float]:
         """A row of `GroupEvaluation`."""
         cells, kind = self.problem.task.num_cells, self.problem.kind
-        inside = episode.target < cells
         before = np.concatenate([episode.start[None], episode.target[:-1]])
+        # The step in which a target enters is none of its own.
+        inside = (episode.target < cells) & (before < cells)
         known = np.where(before < cells, self._known[kind, np.minimum(before, cells - 1)], 0.0)
         forced, some = episode.forced(self.problem.task.t_max), inside.any(axis=1)
         on = episode.action.sum(axis=1) * some
-        counts = (inside, episode.located, on, forced & some)
+        counts = (inside, episode.located & inside, on, forced & some)
         return [
             float(episode.returns[-1]),
             *(float(each.sum()) for each in counts),

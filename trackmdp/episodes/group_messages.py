@@ -97,6 +97,7 @@ class GroupForm(Form):
         start = np.array(row["start"], dtype=np.int64)
         if start.shape != (targets,):
             raise ValueError(f"starts of other than {targets} targets")
+        start = np.where(start < 0, self.run.cells, start)
         return GroupEpisode(**found, start=start, belief=self._belief(mine, len(said)))
 
     def _belief(self, mine: dict[str, list[bytes]], steps: int) -> sparse.csr_array:

@@ -14,9 +14,9 @@ from trackmdp.episodes.episode_draws import Draws
 from trackmdp.episodes.group_episode import GroupEpisode
 from trackmdp.solvers.linear import IndexArray
 from trackmdp.solvers.merging import Beliefs, Clocks, Rule, followed
+from trackmdp.world.group_paths import GroupPaths, group_paths
 from trackmdp.world.model import BoolArray
 from trackmdp.world.outcomes import Costs
-from trackmdp.world.paths import PathSampler
 
 AT_ONCE = 4096
 """Targets of the episodes that are stepped together; 256 steps of their draws are held, 8 MB."""
@@ -33,21 +33,19 @@ def group_episodes(
         seeds: of the episodes.
         beliefs: whether beliefs are kept.
     """
-    each, sampler = max(1, AT_ONCE // len(rule.group)), PathSampler(rule.group.kernel)
+    each, paths = max(1, AT_ONCE // len(rule.group)), group_paths(rule.group, held_out=True)
     return [
         episode
         for begin in range(0, len(seeds), each)
-        for episode in _Batch(rule, sampler, seeds[begin : begin + each], beliefs).run()
+        for episode in _Batch(rule, paths, seeds[begin : begin + each], beliefs).run()
     ]
 
 
 class _Batch:
     """E episodes stepped together until the last one has ended."""
 
-    def __init__(
-        self, rule: Rule, sampler: PathSampler, seeds: Sequence[int], beliefs: bool
-    ) -> None:
-        self._rule, self._group, self._sampler = rule, rule.group, sampler
+    def __init__(self, rule: Rule, paths: GroupPaths, seeds: Sequence[int], beliefs: bool) -> None:
+        self._rule, self._group, self._paths = rule, rule.group, paths
         self._task, self._costs, self._seeds = rule.task, Costs(rule.task), seeds
         self._shape = len(seeds), len(rule.group)
         targets = len(rule.group)
@@ -64,18 +62,17 @@ class _Batch:
         self._kept: list[Beliefs] | None = [] if beliefs else None
 
     def _move_draws(self, count: int, rng: torch.Generator) -> Tensor:
-        return self._sampler.draw(count * self._shape[1], rng).view(count, self._shape[1])
+        return self._paths.sampler.draw(count * self._shape[1], rng).view(count, self._shape[1])
 
     def run(self) -> list[GroupEpisode]:
-        """Step until the last target of the last episode has left."""
-        cells, shape = self._task.num_cells, self._shape
-        starts = [
-            torch.randint(cells, shape[1:], generator=rng).numpy() for rng in self._moves.generators
-        ]
-        place: IndexArray = np.stack(starts) + self._group.kind * cells
-        clocks = self._rule.start(place)
-        beliefs, step = Beliefs.at(np.arange(place.size), place.ravel()), 0
-        while len(row := np.flatnonzero(clocks.present.any(axis=1))):
+        """Step until the last target of the last episode has left, or until the last step allowed."""
+        paths, most = self._paths, self._task.max_steps
+        place = torch.stack([paths.begin(rng) for rng in self._moves.generators])
+        state, inside = paths.state(place).numpy(), paths.inside(place).numpy()
+        clocks = self._rule.start(state, inside)
+        starts = np.where(inside, state % self._task.num_cells, self._task.num_cells)
+        beliefs, step = Beliefs.of(clocks), 0
+        while step != most and len(row := np.flatnonzero(clocks.present.any(axis=1))):
             place, clocks, beliefs = self._step(row, step, place, clocks, beliefs)
             step += 1
         row = np.concatenate([step.pop("row") for step in self._taken])
@@ -91,10 +88,10 @@ class _Batch:
         ]
 
     def _step(
-        self, row: IndexArray, step: int, place: IndexArray, clocks: Clocks, beliefs: Beliefs
-    ) -> tuple[IndexArray, Clocks, Beliefs]:
+        self, row: IndexArray, step: int, place: Tensor, clocks: Clocks, beliefs: Beliefs
+    ) -> tuple[Tensor, Clocks, Beliefs]:
         """One step of `TrackEnv`; the same order of events, the same arithmetic."""
-        task, cells, states = self._task, self._task.num_cells, self._group.kernel.shape[0]
+        task, cells, paths = self._task, self._task.num_cells, self._paths
         moved = beliefs.moved(self._group)
         late: BoolArray = np.any(clocks.present & (clocks.misses > task.t_max), axis=1)
         on = self._rule.sets(clocks, moved)
@@ -103,23 +100,28 @@ class _Batch:
         action.ravel()[on] = True
         draws = torch.zeros(self._shape, dtype=torch.int64)
         draws[row] = self._moves.at(torch.from_numpy(row), step)
-        after = self._sampler.move(torch.from_numpy(place.ravel()), draws.view(-1)).numpy()
-        place = after.reshape(self._shape)
-        present = clocks.present & (place < states)
-        cell = np.where(present, place % cells, 0)
+        place = paths.move(place, draws)
+        inside, state = paths.inside(place).numpy(), paths.state(place).numpy()
+        present = clocks.present & inside
+        cell = np.where(inside, state % cells, 0)
         report = np.take_along_axis(action, cell, axis=1)
         if self._seen is not None:
             chance = np.ones(self._shape)
             chance[row] = self._seen.at(torch.from_numpy(row), step).numpy()
             report &= chance < task.detection[cell]
         seen = present & (report | late[:, None])
-        columns = {"misses": clocks.misses, "action": np.packbits(action, axis=1), "located": seen}
-        columns["target"] = np.where(present, cell, cells)
-        columns["reward"] = self._reward(action, seen, late, present)
+        reward = self._reward(action, seen, late, present)
+        columns = {"misses": clocks.misses, "action": np.packbits(action, axis=1), "reward": reward}
+        # A target that enters is located; it has no part in this step's reward.
+        seen |= inside & ~clocks.present
+        columns |= {"target": np.where(inside, cell, cells), "located": seen}
+        columns["truncated"] = present.any(axis=1)
         self._taken.append({name: column[row] for name, column in columns.items()} | {"row": row})
         if self._kept is not None:
             self._kept.append(moved)
-        return place, *followed(self._group, clocks, moved, on, place, (present, seen))
+        inside &= ~paths.ended(place).numpy()[:, None]
+        reports = inside, seen & inside
+        return place, *followed(self._group, clocks, moved, on, state, reports)
 
     def _reward(
         self, action: BoolArray, seen: BoolArray, late: BoolArray, present: BoolArray
@@ -132,13 +134,16 @@ class _Batch:
 
     def _episode(self, number: int, start: IndexArray, columns: dict[str, Any]) -> GroupEpisode:
         count = self._task.total_sensors
+        # Whether a target was in the grid in the last step, which no exit ended then.
+        truncated = bool(columns.pop("truncated")[-1])
         columns["action"] = np.unpackbits(columns["action"], axis=1, count=count).astype(bool)
         return GroupEpisode(
             number=number,
             seed=self._seeds[number],
             policy=0,
             start=start.astype(np.int64),
-            terminated=True,
+            terminated=not truncated,
+            truncated=truncated,
             belief=self._belief(number, len(columns["reward"])),
             **columns,
         )

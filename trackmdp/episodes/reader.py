@@ -167,7 +167,11 @@ class EpisodeReader:
             found = problem.size, problem.total_sensors, problem.t_max
             if found != (run.size, run.sensors, run.t_max):
                 raise Damaged(PROBLEM)
-        return Group([kinds[kind] for kind in run.kinds]) if run.kinds else kinds[0]
+        if not run.kinds:
+            return kinds[0]
+        if kinds[0].model is None:
+            return Group.of_tracks(kinds[0], len(run.kinds))
+        return Group([kinds[kind] for kind in run.kinds])
 
     def check_all(self) -> None:
         """Check every byte of the file, those without meaning to this reader included."""

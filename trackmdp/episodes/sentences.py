@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from trackmdp.episodes.episode import Recording
-from trackmdp.world.model import Task, World
+from trackmdp.world.model import BoolArray, Task, World
 
 _ARROWS = "→↗↑↖←↙↓↘"
 _STILL = 0.05
@@ -75,10 +75,14 @@ def _of_several(episode: Recording, t: int, task: Task, *, forced: bool) -> str:
     if len(target) > _NAMED:
         missed, left = int((inside & ~located).sum()), int((~inside).sum())
         return (
-            f"{lead}{located.sum()} of {len(target)} targets located, {missed} missed, {left} left"
+            f"{lead}{located.sum()} of {len(target)} targets located, {missed} missed, {left} not in "
+            "the grid"
         )
+    before = np.append(np.atleast_2d(episode.start), episode.target[:t], axis=0)
+    came: BoolArray = np.any(before < task.num_cells, axis=0)
     each = []
     for number, (cell, there, seen) in enumerate(zip(target, inside, located, strict=True)):
         state = f"{'located' if seen else 'missed'} in {where(int(cell), task.columns)}"
-        each.append(f"target {number} {state if there else 'has left'}")
+        away = "has left" if came[number] else "is not there yet"
+        each.append(f"target {number} {state if there else away}")
     return lead + ", ".join(each)

@@ -49,7 +49,7 @@ def simulate(
     *,
     seed: int = ...,
     names: Sequence[str | int] = ...,
-    merge: str = ...,
+    merge: str | None = ...,
 ) -> GroupEpisodes: ...
 
 
@@ -60,7 +60,7 @@ def simulate(
     *,
     seed: int = 0,
     names: Sequence[str | int] = (),
-    **of_group: str,
+    **of_group: Any,
 ) -> Episodes | GroupEpisodes:
     """Independent episodes of a policy, each followed to its own end.
 

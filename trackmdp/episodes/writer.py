@@ -60,10 +60,13 @@ class EpisodeWriter:
         kinds: Sequence[Problem] = [problem] if not isinstance(problem, Group) else problem.kinds
         if isinstance(problem, Group):
             more = {"targets": " ".join(map(str, problem.kind.tolist()))}
+            kinds = kinds if problem.recorded is None else [problem.recorded]
         problem = kinds[0]
         if isinstance(problem, Recorded):
             judged = problem.held_out
-            kinds = [replace(problem, tracks=judged, validation=judged, loaded={})]
+            # Those to learn from predict the moves of several targets.
+            known = problem.tracks if more else judged
+            kinds = [replace(problem, tracks=known, validation=judged, loaded={})]
         names = (schema.numbered(PROBLEM, number) for number in range(len(kinds)))
         tables |= dict(zip(names, map(problem_bytes, kinds), strict=True))
         modes = getattr(problem, "modes", 1)

@@ -32,7 +32,12 @@ def evaluate(
 ) -> Evaluation: ...
 @overload
 def evaluate(
-    problem: Group, policy: PolicyLike, *, merge: str = ..., width: float = ..., seed: int = ...
+    problem: Group,
+    policy: PolicyLike,
+    *,
+    merge: str | None = ...,
+    width: float = ...,
+    seed: int = ...,
 ) -> GroupEvaluation: ...
 
 
@@ -49,7 +54,8 @@ def evaluate(
 
     Args:
         problem: a `World`, whose episodes end by the target's exit or after `max_steps`; `Recorded` tracks; or a
-            `Group` of targets, for which a policy of a single one is merged, and simulated unless the grid is tiny.
+            `Group` of targets, for which a policy of a single one is merged, and simulated unless the grid is tiny; on
+            recorded tracks along all groups of held-out ones.
         policy: a `Policy` or its table, or the same dense, `[M, t_max + 1, M]`; a TensorDict module or a function
             that does not draw (`Policy.from_function`); a `Run`, a `Solution`, a model of Stable-Baselines3; or the
             name of a baseline.
@@ -58,8 +64,8 @@ def evaluate(
             policy takes each report for the truth (`trackmdp.solvers.false_alarms`).
         per_cell: whether detections, sensors and safe actions are wanted of each start cell as well, which takes half
             as long again on a grid too large to factorise (a smaller one has them for nothing).
-        **of_group: of a `Group` alone: `merge`, "gains" or "union"; `width`, half of the 95 % interval of the reward
-            per step that is wanted, .005; and `seed` of the targets.
+        **of_group: of a `Group` alone: `merge`, "gains" or "union" (the default on recorded tracks); `width`, half of
+            the 95 % interval of the reward per step that is wanted, .005; and `seed` of the targets.
 
     Raises:
         UserError: the policy draws at random with unknown probabilities, or is for another grid.
@@ -77,20 +83,21 @@ def evaluate(
 
 
 def _of_group(
-    group: Group, policy: Any, *, merge: str = "gains", width: float = 0.005, seed: int = 0
+    group: Group, policy: Any, *, merge: str | None = None, width: float = 0.005, seed: int = 0
 ) -> GroupEvaluation:
     """See `evaluate`."""
     return evaluate_group(group_rule(group, policy, merge), width=width, seed=seed)
 
 
-def group_rule(group: Group, policy: Any, merge: str = "gains") -> Rule:
+def group_rule(group: Group, policy: Any, merge: str | None = None) -> Rule:
     """A policy for several targets: itself, or the merged plans of single ones."""
     if isinstance(policy, Rule):
         return policy.within(group)
     if (tables := getattr(policy, "tables", None)) is None:
         if isinstance(held := getattr(policy, "policy", None), Rule):
             return held.within(group)
-        tables = [_table(world, policy) for world in group.kinds]
+        singles = [group.single] if group.recorded else group.kinds
+        tables = [_table(each, policy) for each in singles]
     return make_rule(group, tables, merge)
 
 

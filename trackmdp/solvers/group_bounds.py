@@ -7,6 +7,8 @@ both positions, revealed before every step: g_1j / (g_1j + g_2j), its gains by t
 
 from __future__ import annotations
 
+import itertools
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -26,7 +28,9 @@ _ENOUGH = 1e-7
 
 
 def upper_bound(group: Group) -> float:
-    """Proved: no policy for the targets has a higher AIHTR."""
+    """Proved: no policy for the targets has a higher AIHTR; nan on recorded tracks, which have no bound."""
+    if group.recorded is not None:
+        return math.nan
     equal = equal_shares(group)
     task = group.task
     if len(group) != 2 or task.num_cells**2 > MOST_PAIRS or task.budget is not None:
@@ -79,14 +83,16 @@ class _Paired:
         """`[M, M]`, of this target's and the other's cell at the start, both located."""
         world, last = self.world, self.world.num_choices
         table = np.zeros((world.num_cells, world.num_cells + 1, last + 1))
-        longest = float(expected_steps(world).max())
-        while True:
+        most = world.max_steps
+        longest = float(expected_steps(world).max()) if most is None else float(most)
+        for number in itertools.count(1):
             after = self._round(table)
             change = float((after - table).max())
             table = after
-            if change <= _ENOUGH:
-                # The most that all further rounds add, as every round is a step of this target in the grid.
-                return table[:, :-1, 0] + change * longest
+            # The most that all further rounds add, as every round is a step of this target in the grid.
+            if change <= _ENOUGH or number == most:
+                break
+        return table[:, :-1, 0] + (0.0 if number == most else change * longest)
 
     @cached_property
     def _stays(self) -> sparse.csr_array:

@@ -65,8 +65,15 @@ def joint_chain(rule: Rule, most: int = MOST_STATES) -> Array | None:
     chain = explored(group, choices, most)
     if chain is None:
         return None
-    system = sparse.eye_array(chain.states, format="csc") - chain.moves
-    found = sparse.linalg.spsolve(sparse.csc_array(system), chain.totals)
+    if group.task.max_steps is None:
+        system = sparse.eye_array(chain.states, format="csc") - chain.moves
+        found = sparse.linalg.spsolve(sparse.csc_array(system), chain.totals)
+    else:
+        found = np.zeros_like(chain.totals)
+        for _ in range(group.task.max_steps):
+            before, found = found, chain.totals + chain.moves @ found
+            if np.array_equal(before, found):
+                break
     return np.asarray(found[: chain.starts].mean(axis=0, keepdims=True))
 
 

@@ -23,16 +23,16 @@ class GroupEvaluation(Carded):
     Attributes:
         totals: `[E, 7]` of simulated episodes: reward, steps of targets in the grid, detections, sensors on by choice,
             safe actions, steps of the episode, reward of single targets that are always known (`known_rewards`); or
-            one row of exact expectations of the first six.
+            one row of exact expectations of the first six. On recorded tracks a row for each group of held-out tracks.
         exact: whether they are exact.
-        expected_length: steps until the last target has left, exact.
-        controls: exact means of the second and of the last column.
+        expected_length: steps until the last target has left, exact; on recorded tracks the mean.
+        controls: exact means of the second and of the last column; None on recorded tracks, which have none.
     """
 
     totals: Array
     exact: bool
     expected_length: float
-    controls: tuple[float, float]
+    controls: tuple[float, float] | None
 
     def _ratio(self, part: int, whole: int) -> MeanInterval:
         if self.exact:
@@ -50,6 +50,8 @@ class GroupEvaluation(Carded):
         count, reward = len(self.totals), self.totals[:, 0]
         if self.exact:
             return MeanInterval(float(reward[0]), float(reward[0]), float(reward[0]), 1)
+        if self.controls is None:
+            return ratio(reward, np.ones(count))
         columns = self.totals[:, [1, 6]] - self.totals[:, [1, 6]].mean(axis=0)
         slope = np.linalg.lstsq(columns, reward, rcond=None)[0]
         mean = float((reward - (self.totals[:, [1, 6]] - self.controls) @ slope).mean())
@@ -60,6 +62,8 @@ class GroupEvaluation(Carded):
     @property
     def reward_per_step(self) -> MeanInterval:
         """Reward per step of an episode, the last exit step included."""
+        if self.controls is None:
+            return self._ratio(0, 5)
         return _times(self.aihtr, 1.0 / self.expected_length)
 
     @property
@@ -77,14 +81,21 @@ class GroupEvaluation(Carded):
         """Safe actions per step."""
         return self._ratio(4, 5)
 
+    @property
+    def about(self) -> str:
+        """What the figures are means over."""
+        if self.exact:
+            return "exact"
+        kind = "simulated episodes" if self.controls else "groups of held-out tracks"
+        return f"{len(self.totals):,} {kind}, 95 %"
+
     def card(self) -> Card:
         """The figures with their intervals."""
-        about = "exact" if self.exact else f"{len(self.totals):,} simulated episodes, 95 %"
         names = ("aihtr", "reward_per_step", "accuracy", "sensors_per_step", "safe_per_step")
         facts = {name.replace("_", " "): with_ends(getattr(self, name)) for name in names}
         facts["steps per episode"] = decimal(self.expected_length, 1)
         return Card(
-            f"Evaluation of several targets: {about}", {"AIHTR": facts.pop("aihtr")} | facts
+            f"Evaluation of several targets: {self.about}", {"AIHTR": facts.pop("aihtr")} | facts
         )
 
 
@@ -97,4 +108,8 @@ def with_ends(found: MeanInterval) -> str:
     """A figure and its interval."""
     if found.low is None or found.high is None or found.low == found.high:
         return decimal(found.mean, 4)
-    return f"{decimal(found.mean, 4)} ± {decimal((found.high - found.low) / 2, 4)}"
+    above, below = found.high - found.mean, found.mean - found.low
+    if abs(above - below) > 1e-6 * (above + below):
+        ends = f"{decimal(found.low, 4)} to {decimal(found.high, 4)}"
+        return f"{decimal(found.mean, 4)} ({ends})"
+    return f"{decimal(found.mean, 4)} ± {decimal(above, 4)}"

@@ -6,7 +6,9 @@ for every policy of a group (the generators' names have no policy in them), so t
 
 from __future__ import annotations
 
+import itertools
 import math
+from typing import Any
 
 import numpy as np
 
@@ -15,8 +17,9 @@ from trackmdp.seeding import derive
 from trackmdp.solvers.group_chain import joint_chain
 from trackmdp.solvers.group_figures import GroupEvaluation
 from trackmdp.solvers.linear import IndexArray, accumulate, grid_of
-from trackmdp.solvers.merging import Beliefs, Clocks, Rule, followed, switched_on
+from trackmdp.solvers.merging import Beliefs, Clocks, Reports, Rule, followed, switched_on
 from trackmdp.world.model import Array, BoolArray
+from trackmdp.world.together import Together
 
 _FIRST = 64
 """Episodes of the first batch, from which the number needed for the wanted width is worked out."""
@@ -43,9 +46,19 @@ def evaluate_group(
     if not isinstance(width, int | float) or not 0 < width < math.inf:
         raise UserError(f"width={width}: expected a number > 0")
     group = rule.group
+    if group.recorded is not None:
+        found = _Along(rule).totals()
+        return GroupEvaluation(found, False, float(found[:, 5].mean()), None)
     exact_steps = group.expected_steps, (group.target_steps, known_mean(rule))
     if episodes is None and (exact := joint_chain(rule)) is not None:
         return GroupEvaluation(exact, True, *exact_steps)
+    return _played(rule, exact_steps, width, seed, episodes)
+
+
+def _played(
+    rule: Rule, exact_steps: Any, width: float, seed: int, episodes: int | None
+) -> GroupEvaluation:
+    """See `evaluate_group`; simulated."""
     first = simulated(rule, min(episodes or _FIRST, _MOST), seed, "first")
     found = GroupEvaluation(first, False, *exact_steps)
     parts = [first]
@@ -88,10 +101,17 @@ def known_rewards(rule: Rule) -> list[Array]:
 
 def known_mean(rule: Rule) -> float:
     """The mean over episodes of the sum of `known_rewards` of all targets."""
-    means = [
-        float(accumulate(world.kernel, reward, grid_of(world)).mean())
-        for world, reward in zip(rule.group.kinds, known_rewards(rule), strict=True)
-    ]
+    means = []
+    for world, reward in zip(rule.group.kinds, known_rewards(rule), strict=True):
+        if world.max_steps is None:
+            total = accumulate(world.kernel, reward, grid_of(world))
+        else:
+            total = np.zeros(world.num_cells)
+            for _ in range(world.max_steps):
+                before, total = total, reward + world.kernel @ total
+                if np.abs(total - before).max() <= 1e-14 * np.abs(total).max():
+                    break
+        means.append(float(total.mean()))
     return sum(means[kind] for kind in rule.group.kind)
 
 
@@ -125,10 +145,11 @@ class _Batch:
 
     def totals(self) -> Array:
         """`[E, 7]`."""
-        rows = np.arange(math.prod(self.shape))
-        beliefs, found = Beliefs.at(rows, self.place.ravel()), np.zeros((self.shape[0], 7))
-        moved = Beliefs.at(rows[:0], rows[:0])
-        while self.clocks.present.any():
+        beliefs, found = Beliefs.of(self.clocks), np.zeros((self.shape[0], 7))
+        moved = Beliefs.at(*np.zeros((2, 0), dtype=np.int64))
+        for _ in itertools.count() if self.task.max_steps is None else range(self.task.max_steps):
+            if not self.clocks.present.any():
+                break
             if not self.rule.reads_history:
                 moved = beliefs.moved(self.group)
             found[:, 6] += (self.known[self.place] * self.clocks.present).sum(axis=1)
@@ -149,7 +170,7 @@ class _Batch:
             report &= self.reports.random(shape) < task.detection[self.place % self.cells]
         seen = present & (report | forced[:, None])
         self._add(found, on, seen, present, before, forced)
-        reports = present, seen
+        reports = self._followed(present, seen)
         self.clocks, beliefs = followed(self.group, clocks, moved, on, self.place, reports)
         return beliefs
 
@@ -162,6 +183,10 @@ class _Batch:
         present = before & (entry < end)
         entry = np.clip(entry, begin, len(kernel.indices) - 1)
         return np.where(present, kernel.indices[entry], self.place), present
+
+    def _followed(self, present: BoolArray, seen: BoolArray) -> Reports:
+        """Which targets are followed on after a step, and which of them were located."""
+        return present, seen
 
     def _add(
         self,
@@ -183,3 +208,41 @@ class _Batch:
         found[:, 3] += np.bincount(episode, minlength=count) * any_left
         found[:, 4] += forced & any_left
         found[:, 5] += before.any(axis=1)
+
+
+class _Along(_Batch):
+    """All groups of held-out tracks, of which each is an episode."""
+
+    def __init__(self, rule: Rule) -> None:
+        recorded = rule.group.recorded
+        assert recorded is not None
+        self.motion = recorded.held_out.motion()
+        together = Together(recorded.held_out, len(rule.group))
+        self.at = together.places(together.groups)
+        super().__init__(rule, len(self.at), 0)
+
+    def _start(self) -> Clocks:
+        return self.rule.start(*self._cells())
+
+    def _cells(self) -> tuple[IndexArray, BoolArray]:
+        """`[E, K]`, cells of the targets, and whether they are in the grid."""
+        inside = (self.at >= 0) & (self.at < self.motion.num_states)
+        return np.where(inside, self.motion.cell[np.where(inside, self.at, 0)], 0), inside
+
+    def _moved(self, before: BoolArray) -> tuple[IndexArray, BoolArray]:
+        # The moves are certain; a target that waits comes one track nearer.
+        points = self.motion.num_states
+        on = self.motion.stay[np.clip(self.at, 0, points - 1)] > 0
+        after = np.where(on & (self.at < points), self.at + 1, points)
+        self.at = np.where(self.at < 0, self.at + points, after)
+        cell, inside = self._cells()
+        self.entered = inside & ~before
+        return cell, inside & before
+
+    def _followed(self, present: BoolArray, seen: BoolArray) -> Reports:
+        assert self.motion.ends is not None
+        stops = np.append(self.motion.ends, False)[np.maximum(self.at, 0)]
+        inside = present | self.entered
+        # Where all recordings stop that are left, the episode is over.
+        inside &= np.any(inside & ~stops, axis=1, keepdims=True)
+        return inside, (seen | self.entered) & inside

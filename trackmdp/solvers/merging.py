@@ -80,6 +80,12 @@ class Beliefs:
         """Targets known to be in a state."""
         return cls(row, state, np.ones(len(row)))
 
+    @classmethod
+    def of(cls, clocks: Clocks) -> Beliefs:
+        """At the start, where the targets that are there are located."""
+        rows = np.flatnonzero(clocks.present)
+        return cls.at(rows, clocks.located.ravel()[rows])
+
     def moved(self, group: Group) -> Beliefs:
         """After a move; masses of a row then sum to the probability that its target is in the grid."""
         kernel = group.kernel
@@ -147,11 +153,12 @@ class Rule(ABC):
         """The same policy for other targets of the same task."""
         return self if group is self.group else type(self)(group, self.tables)
 
-    def start(self, located: IndexArray) -> Clocks:
-        """All targets of E episodes located in the states `[E, K]`."""
+    def start(self, located: IndexArray, present: BoolArray | None = None) -> Clocks:
+        """Targets of E episodes located in the states `[E, K]`: all, or those that are `present` `[E, K]`."""
         history = np.zeros((len(located), self.task.num_choices, self.cells), dtype=bool)
         kept = history if self.reads_history else None
-        return Clocks(located, np.zeros_like(located), np.ones(located.shape, dtype=bool), kept)
+        here = np.ones(located.shape, dtype=bool) if present is None else present
+        return Clocks(np.where(here, located, 0), np.zeros_like(located), here, kept)
 
     def first_sets(self) -> list[sparse.csr_array]:
         """For each kind `[M, S]`, the set of a single target that is located."""
@@ -205,7 +212,9 @@ class Merged(Rule):
             [],
             [(list[IndexArray](), list[Array]()) for _ in range(self.task.num_choices)],
         )
-        for kind, (world, table) in enumerate(zip(self.group.kinds, self.tables, strict=True)):
+        # Plans are those of whole episodes, also where these are cut off.
+        whole = self.group.but(max_steps=None) if self.task.max_steps else self.group
+        for kind, (world, table) in enumerate(zip(whole.kinds, self.tables, strict=True)):
             renewal = Renewal(world, world.motion)
             sets = renewal.sets(table)
             value = renewal.value(sets)
@@ -267,9 +276,16 @@ def _sets(table: PolicyTable) -> sparse.csr_array:
     return table.sets
 
 
-def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str = "gains") -> Rule:
-    """The policy for several targets that single ones make, merged by `gains`, or their plain `union`."""
+def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str | None = None) -> Rule:
+    """The policy for several targets that single ones make, merged by `gains`, or their plain `union`.
+
+    None: by gains, but on recorded tracks, of which the moves pooled by cell say too little, the union. A budget needs
+    gains.
+    """
     kinds = {"gains": Merged, "union": Union}
+    if merge is None:
+        known = group.recorded is None or group.task.budget is not None
+        merge = "gains" if known else "union"
     if merge not in kinds:
         raise UserError(f"merge={merge}: expected gains or union")
     return kinds[merge](group, tables)

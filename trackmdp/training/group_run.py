@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from trackmdp.config.roots import OptimalBoundConfig
 from trackmdp.policies.policy import Policy, actor_table
 from trackmdp.seeding import derive
 from trackmdp.solvers import optimal
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation, regret_per_step
 from trackmdp.solvers.group_bounds import upper_bound
 from trackmdp.solvers.group_figures import GroupEvaluation, with_ends
@@ -42,13 +44,14 @@ class GroupEvaluator(Evaluator):
 
     def __init__(self, group: Group, seed: int) -> None:
         super().__init__(group.kinds[0])
-        self._seed = derive(seed, "scores")
+        self._seed, self._chosen_by = derive(seed, "scores"), group.selection
         self.upper = self.bounds["clocked"] = upper_bound(group)
-        self.lower = -math.inf
+        self.lower = -math.inf if group.recorded is None else math.nan
 
     def score(self, policy: Rule) -> Score:  # type: ignore[override]  # no table
-        """Figures of `_SCORED` episodes."""
-        return self._score(means(evaluate_group(policy, seed=self._seed, episodes=_SCORED)))
+        """Figures of `_SCORED` episodes, on recorded tracks of all groups of those to choose by."""
+        rule = policy.within(self._chosen_by)
+        return self._score(means(evaluate_group(rule, seed=self._seed, episodes=_SCORED)))
 
 
 def evaluator_of(subject: Subject, seed: int) -> Evaluator:
@@ -92,9 +95,10 @@ class Several:
         group: the targets.
         merge: how single targets' plans were put together; joint for a policy that was learned of all.
         figures: of the policy.
-        upper: proved: no policy has a higher AIHTR.
+        upper: proved: no policy has a higher AIHTR; nan on recorded tracks.
         solution: optima of single targets; None where they were not solved for.
         merged: figures of these, merged.
+        fixed: figures of policies that need no learning, on recorded tracks.
     """
 
     group: Group
@@ -103,11 +107,14 @@ class Several:
     upper: float
     solution: GroupSolution | None
     merged: GroupEvaluation | None
+    fixed: Mapping[str, GroupEvaluation] = field(default_factory=dict)
 
     @property
     def score(self) -> Score:
         """The means, and their regrets."""
         found = means(self.figures)
+        if math.isnan(self.upper):
+            return Score(found, math.nan, math.nan)
         best = max(each.aihtr.mean for each in (self.figures, self.merged) if each is not None)
         upper, lower = (regret_per_step(end, found) for end in (self.upper, best))
         return Score(found, upper, lower)
@@ -130,7 +137,7 @@ class Several:
 
     def rows(self, name: str) -> list[list[str]]:
         """A line for each policy: name, AIHTR, reward per step, accuracy and sensors per step; and the bound."""
-        policies = {name: self.figures}
+        policies = {name: self.figures, **self.fixed}
         if self.merged is not None:
             policies["merged optimum"] = self.merged
         shown = ("aihtr", "reward_per_step", "accuracy", "sensors_per_step")
@@ -140,7 +147,10 @@ class Several:
         ]
         if self.solution is not None:
             rows.append(["separate trackers", *self._plain(self.solution.apart)])
-        return [*rows, ["upper bound", *self._plain(self.upper)]]
+        return [
+            *rows,
+            *([] if math.isnan(self.upper) else [["upper bound", *self._plain(self.upper)]]),
+        ]
 
     def _plain(self, aihtr: float) -> list[str]:
         return [f"{aihtr:,.4f}", f"{aihtr / self.figures.expected_length:.4f}", "", ""]
@@ -160,7 +170,9 @@ def beside(
     """
     group = rule.group
     figures, upper = evaluate_group(rule, width=width, seed=seed), upper_bound(group)
-    if not cfg.enabled:
+    if group.recorded is not None:
+        return Several(group, rule.name, figures, upper, None, None, _fixed(group))
+    if not cfg.enabled or group.task.max_steps is not None:
         return Several(group, rule.name, figures, upper, None, None)
     singles = (
         tuple(
@@ -173,6 +185,13 @@ def beside(
     solution = GroupSolution(group, singles, upper, sum(each.seconds for each in singles))
     merged = evaluate_group(solution.policy, width=width, seed=seed)
     return Several(group, rule.name, figures, upper, solution, merged)
+
+
+def _fixed(group: Group) -> dict[str, GroupEvaluation]:
+    """Figures of policies that a learned one is compared with on recorded tracks, each target's sets together."""
+    assert group.recorded is not None
+    names = () if group.task.budget is not None else ("all_on", "none")
+    return {name: evaluate(group, name) for name in names}
 
 
 def _intervals(found: GroupEvaluation) -> dict[str, Any]:

@@ -63,7 +63,8 @@ class TrackEnv(EnvBase):
 
     Of a `Group` of K targets `last_cell` and `steps_since_detection` are `[*B, K]`, with `present` `[*B, K]` bool,
     which are in the grid; and `action_history` `[*B, t_max+1, S]` holds the last actions, the latest first, since the
-    last safe action, which locates all targets. The episode ends when the last target has left.
+    last safe action, which locates all targets. The episode ends when the last target has left. On recorded tracks a
+    target may enter later: it is then located, and before it `last_cell` is 0.
 
     Args:
         world: the task and the target's motion, recorded tracks, or a group of targets.
@@ -154,8 +155,8 @@ class TrackEnv(EnvBase):
     def _make_specs(self, world: Task) -> None:
         b, k, choices = self.batch_size, self.num_sensors, self.t_max + 1
 
-        def numbers(count: int) -> Categorical:
-            shape = torch.Size((*b, *self._targets))
+        def numbers(count: int, *each: int) -> Categorical:
+            shape = torch.Size((*b, *each))
             return Categorical(count, shape=shape, dtype=torch.int64, device=self.device)
 
         def bits(*shape: int) -> Binary:
@@ -163,8 +164,8 @@ class TrackEnv(EnvBase):
 
         observed = {
             # n takes t_max + 2 values: 0 ... t_max + 1, the last one with the safe action forced.
-            "last_cell": numbers(self.num_cells),
-            "steps_since_detection": numbers(choices + 1),
+            "last_cell": numbers(self.num_cells, *self._targets),
+            "steps_since_detection": numbers(choices + 1, *self._targets),
             "action_history": bits(choices, k),
         }
         if self._targets:

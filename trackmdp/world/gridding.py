@@ -67,7 +67,7 @@ def to_tracks(
     flat, place = _placed(positions, grid, source, ~np.isin(positions.track, held_out))
     begin, x, y, last = _sampled(flat, grid)
     cells = place.cells(x, y, grid.size)
-    tracks, counts = _cut(cells, begin, last, flat.track, grid)
+    tracks, counts = _cut(cells, begin, last, flat, grid)
     gaps = int(_breaks(flat, grid).sum()) - len(np.unique(flat.track))
     report = {
         "reports read": positions.read,
@@ -179,7 +179,7 @@ def _middle(x: Array, y: Array, grid: Gridding) -> tuple[float, float]:
 
 
 def _cut(
-    cells: np.ndarray, place: np.ndarray, last: np.ndarray, track: np.ndarray, grid: Gridding
+    cells: np.ndarray, place: np.ndarray, last: np.ndarray, flat: Positions, grid: Gridding
 ) -> tuple[Tracks, dict[str, int]]:
     """The runs of cells inside the grid, of sufficient length."""
     inside = cells >= 0
@@ -194,7 +194,17 @@ def _cut(
     kept = lengths >= grid.shortest
     exits = (left | (last[ends] & grid.exits))[kept]
     chosen = np.repeat(kept, lengths)
-    made = Tracks(cells[inside][chosen], ends_of(lengths[kept]), exits, track[place[begins]][kept])
+    first = begins[kept]
+    # Steps since the first report of all, to the nearest one; in its path a run begins some samples after the first.
+    within = first - np.searchsorted(place, place[first])
+    clock = np.rint((flat.time[place[first]] - flat.time.min()) / grid.step).astype(np.int64)
+    made = Tracks(
+        cells[inside][chosen],
+        ends_of(lengths[kept]),
+        exits,
+        flat.track[place[first]],
+        clock + within,
+    )
     counts = {
         "steps outside of the grid": int((~inside).sum()),
         f"steps in {int((~kept).sum()):,} tracks of fewer than {grid.shortest} cells": int(

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ from trackmdp.config.several import MOST_TARGETS
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, grid_words
 from trackmdp.world.model import Array, Task, World
-from trackmdp.world.tracks import Problem, modelled
+from trackmdp.world.tracks import Problem, Recorded
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -28,13 +28,16 @@ class Group(Carded):
 
     Args:
         worlds: one for each target, alike but for the motion; the same object where targets move alike.
+        recorded: tracks that the targets follow in place of these motions, by which their moves are then predicted
+            alone; see `of_tracks`.
 
     Raises:
-        UserError: they differ in more than the motion, or have modes, footprints, a window, a memory, `max_steps` or a
-            safe action that misses.
+        UserError: they differ in more than the motion, or have modes, footprints, a window, a memory or a safe action
+            that misses.
     """
 
     worlds: Sequence[World]
+    recorded: Recorded | None = None
 
     def __post_init__(self) -> None:
         many = isinstance(self.worlds, Sequence) and 1 <= len(self.worlds) <= MOST_TARGETS
@@ -50,8 +53,22 @@ class Group(Carded):
                 )
         object.__setattr__(self, "worlds", worlds)  # the dataclass is frozen
 
+    @classmethod
+    def of_tracks(cls, recorded: Recorded, count: int) -> Group:
+        """Targets on recorded tracks, `count` at the same time; their moves are predicted by the tracks to learn from.
+
+        Tracks whose times overlap are followed together; where the recording has no times, any are (`together`).
+        """
+        kernel = recorded.tracks.kernel(recorded.num_cells)
+        return cls([World.of(recorded, kernel)] * count, recorded)
+
     def __len__(self) -> int:
         return len(self.worlds)
+
+    @property
+    def selection(self) -> Group:
+        """As of a `Problem`: on recorded tracks those to choose by take the place of the held-out ones."""
+        return self if self.recorded is None else Group(self.worlds, self.recorded.selection)
 
     @cached_property
     def task(self) -> Task:
@@ -71,6 +88,11 @@ class Group(Carded):
     def kinds(self) -> tuple[World, ...]:
         """The different motions, by their first target."""
         return tuple({id(world): world for world in self.worlds}.values())
+
+    @property
+    def single(self) -> Problem:
+        """The first target alone: its world, or the recorded tracks."""
+        return self.recorded or self.kinds[0]
 
     @cached_property
     def kind(self) -> npt.NDArray[np.int64]:
@@ -101,8 +123,9 @@ class Group(Carded):
     @cached_property
     def _steps(self) -> tuple[float, float]:
         inside = [np.full(world.num_cells, 1.0 / world.num_cells) for world in self.kinds]
-        total, each, left = 0.0, 0.0, 1.0
-        while left > 1e-12 * max(total, 1.0):
+        total, each, left, taken = 0.0, 0.0, 1.0, 0
+        while left > 1e-12 * max(total, 1.0) and taken != self.task.max_steps:
+            taken += 1
             # The step taken counts where any target was in the grid before it.
             total += left
             inside = [mass @ world.kernel for mass, world in zip(inside, self.kinds, strict=True)]
@@ -114,13 +137,16 @@ class Group(Carded):
     def but(self, **changes: Any) -> Group:
         """The same targets in a task that differs in `changes`."""
         changed = [world.but(**changes) for world in self.kinds]
-        return Group(tuple(changed[kind] for kind in self.kind))
+        recorded = None if self.recorded is None else replace(self.recorded, **changes)
+        return Group(tuple(changed[kind] for kind in self.kind), recorded)
 
     def card(self) -> Card:
         """The card of the first target's world, and how many targets there are."""
         task = self.task
         motions = "all alike" if len(self.kinds) == 1 else f"{len(self.kinds)} motions"
-        facts = {"targets": f"{len(self)}, {motions}"} | task.facts()
+        if self.recorded is not None:
+            motions = "on recorded tracks"
+        facts = {"targets": f"{len(self)}, {motions}"} | self.single.facts()
         return Card(f"Group: {grid_words(task.size)}", facts)
 
 
@@ -142,16 +168,19 @@ def one_target(subject: Subject, caller: str) -> Problem:
 
 
 def group_of(subject: Subject, count: int) -> Group:
-    """The targets of a subject, `count` that move alike where it is a world.
+    """The targets of a subject, `count` that move alike where it is a world, or on its tracks.
 
     Raises:
-        UserError: it is recorded tracks, or a group of another number.
+        UserError: it is a group of another number.
     """
     if isinstance(subject, Group):
         if len(subject) != count:
             raise UserError(f"targets.count={count}: expected {len(subject)}, as the policy has")
         return subject
-    return Group([modelled(subject, f"targets.count={count}")] * count)
+    world = subject.model
+    return (
+        Group.of_tracks(cast(Recorded, subject), count) if world is None else Group([world] * count)
+    )
 
 
 def learned_in(subject: Subject, count: int, *, joint: bool) -> Subject:
@@ -169,7 +198,7 @@ def learned_in(subject: Subject, count: int, *, joint: bool) -> Subject:
             f"train: a Group of {len(subject.kinds)} motions, expected one with an algorithm that learns a single "
             "target's plan; train on each world, or take a2c, ppo or dqn"
         )
-    return subject.kinds[0]
+    return subject.single
 
 
 def _of_one_target(world: World) -> str | None:
@@ -178,7 +207,6 @@ def _of_one_target(world: World) -> str | None:
         f"modes={world.modes}": world.modes > 1,
         "footprints": world.coverage is not None,
         f"grid.window={world.window}": world.window is not None,
-        f"grid.max_steps={world.max_steps}": world.max_steps is not None,
         f"task.memory={world.memory}": world.memory != "cell",
         "a safe action that misses": not world.safe,
     }
@@ -187,6 +215,6 @@ def _of_one_target(world: World) -> str | None:
 
 def _alike(one: World, other: World) -> bool:
     """Whether two worlds are the same task."""
-    names = ("size", "cost", "t_max", "safe_cost", "reward", "detection", "budget")
+    names = ("size", "cost", "t_max", "safe_cost", "reward", "detection", "budget", "max_steps")
     pairs = [(getattr(one, name), getattr(other, name)) for name in names]
     return all(np.array_equal(a, b, equal_nan=isinstance(a, np.ndarray)) for a, b in pairs)

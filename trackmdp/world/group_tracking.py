@@ -8,30 +8,9 @@ from torch import Tensor
 from trackmdp.world.draws import UniformDraws
 from trackmdp.world.dynamics import State, rowwise
 from trackmdp.world.group import Group
+from trackmdp.world.group_paths import group_members, group_paths
 from trackmdp.world.outcomes import Costs
-from trackmdp.world.paths import PathSampler
-from trackmdp.world.targets import Targets
 from trackmdp.world.tracking import TargetBatch
-
-
-class _Members(Targets):
-    """Targets of all groups in a row, each in a cell of its own motion at the start.
-
-    Args:
-        group: the targets.
-        count: B, groups.
-        device: of the draws.
-    """
-
-    def __init__(self, group: Group, count: int, device: torch.device) -> None:
-        super().__init__(PathSampler(group.kernel, device=device))
-        cells, kind = group.task.num_cells, torch.as_tensor(group.kind, device=device)
-        self._cells, self._offset = cells, (kind * cells).repeat(count)
-
-    def _start(self, rows: Tensor) -> Tensor:
-        rng = self.generators["start"]
-        cell = torch.randint(self._cells, rows.shape, generator=rng, device=self.device)
-        return cell + self._offset
 
 
 class GroupTracking(TargetBatch):
@@ -50,8 +29,9 @@ class GroupTracking(TargetBatch):
     def __init__(self, group: Group, count: int, device: torch.device) -> None:
         task = group.task
         self.count, self.device, self.targets = count, device, len(group)
-        self._targets = _Members(group, count, device)
-        self._states, self._cells = group.kernel.shape[0], task.num_cells
+        self._paths = group_paths(group, device)
+        self._targets = group_members(self._paths, count)
+        self._cells, self._max_steps = task.num_cells, task.max_steps
         self._reports = UniformDraws(device, None if task.perfect else "report")
         self._every = torch.ones(count * self.targets, dtype=torch.bool, device=device)
         self._costs, self._t_max = Costs(task, device), task.t_max
@@ -69,19 +49,24 @@ class GroupTracking(TargetBatch):
     def begin(self, done: Tensor) -> None:
         """New episodes in the rows of a mask `[B, 1]`."""
         if torch.compiler.is_compiling() or done.any():
-            rows, fresh = done.squeeze(-1), self._fresh(self._targets.start(self._every))
+            begun = done.expand(-1, self.targets).reshape(-1)
+            rows, fresh = done.squeeze(-1), self._fresh(self._targets.start(begun))
             self.state = {key: rowwise(rows, fresh[key], each) for key, each in self.state.items()}
 
     def _fresh(self, place: Tensor) -> State:
         """Initial states of targets in `place` `[B K]`, which are located."""
         place = place.view(self.count, self.targets)
+        inside = self._paths.inside(place)
         state = {
             "place": place,
-            "last_cell": place % self._cells,
+            # Where a target will enter is nothing that a tracker knows.
+            "last_cell": torch.where(inside, self._paths.cell(place), 0),
             "steps_since_detection": torch.zeros_like(place),
-            "present": torch.ones_like(place, dtype=torch.bool),
+            "present": inside,
             "action_history": torch.zeros(self._history, dtype=torch.bool, device=self.device),
         }
+        if self._max_steps:
+            state["step_count"] = place.new_zeros(self.count)
         if self.masked:
             state["action_mask"] = self._available.expand(self.count, -1)
         return state
@@ -90,9 +75,10 @@ class GroupTracking(TargetBatch):
         """One step with the sensors of `action` `[B, S]` bool on; returns the state, the reward and the flags."""
         state, shape = self.state, (self.count, self.targets)
         draws, uniform = self._targets.draw(self._every), self._reports(self._every)
-        place = self._targets.sampler.move(state["place"].reshape(-1), draws).view(shape)
-        present, cell = place < self._states, place % self._cells
-        n = state["steps_since_detection"]
+        place = self._paths.move(state["place"], draws.view(shape))
+        inside, cell = self._paths.inside(place), self._paths.cell(place)
+        # A target that enters is located, and counts from the next step on, as the start of an episode is no step.
+        present, n = inside & state["present"], state["steps_since_detection"]
         forced = (n > self._t_max).any(-1, keepdim=True)
         report = action.gather(1, cell)
         if uniform is not None:
@@ -103,22 +89,36 @@ class GroupTracking(TargetBatch):
         reward = self._reward * seen.sum(-1, keepdim=True) - spent
         # The last action comes first; after the safe action, which locates all targets, nothing is remembered.
         history = torch.cat([action.unsqueeze(1), state["action_history"][:, :-1]], 1)
+        seen = seen | (inside ^ present)
         following = {
             "place": place,
             "last_cell": torch.where(seen, cell, state["last_cell"]),
             # A target that has left keeps no clock, which would force the safe action.
-            "steps_since_detection": torch.where(present & ~seen, n + 1, 0),
-            "present": present,
+            "steps_since_detection": torch.where(inside & ~seen, n + 1, 0),
+            "present": inside,
             "action_history": history & ~forced.unsqueeze(-1),
             "reward": reward.float(),
         }
+        done = self._paths.ended(place).unsqueeze(-1)
+        if self._max_steps:
+            following["step_count"] = state["step_count"] + 1
+            done = done | (following["step_count"] >= self._max_steps).unsqueeze(-1)
         if self.masked:
             following["action_mask"] = state["action_mask"]
         self.state = {key: following[key] for key in state}
-        none = torch.zeros_like(any_left)
-        return following | {"done": ~any_left, "terminated": ~any_left, "truncated": none}
+        # The exit of the last target counts, also on the last step allowed.
+        return following | {
+            "done": done,
+            "terminated": done & ~any_left,
+            "truncated": done & any_left,
+        }
 
     def target(self) -> Tensor:
-        """`[B, K]` cells of the targets, M after an exit."""
+        """`[B, K]` cells of the targets, M where they are not in the grid."""
         place = self.state["place"]
-        return torch.where(place < self._states, place % self._cells, self._cells)
+        return torch.where(self._paths.inside(place), self._paths.cell(place), self._cells)
+
+    def _check(self, rows: State) -> None:
+        """See `TargetBatch`; on tracks, targets that are still to enter are no error."""
+        place = rows["place"]
+        super()._check(rows | {"place": place.clamp_min(0) if self._paths.waits else place})

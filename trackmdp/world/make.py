@@ -130,6 +130,16 @@ def make_world(
     return Group([build_world(cfg)] * targets)
 
 
+@overload
+def load_tracks(
+    path: str | Path | Any, size: Size = ..., *, targets: Literal[1] = ..., **options: Any
+) -> Recorded: ...
+@overload
+def load_tracks(
+    path: str | Path | Any, size: Size = ..., *, targets: int, **options: Any
+) -> Group: ...
+
+
 def load_tracks(
     path: str | Path | Any,
     size: Size = default("grid.size"),
@@ -148,8 +158,9 @@ def load_tracks(
     cell: float | None = default("grid.cell"),
     origin: Sequence[float] | None = default("grid.origin"),
     crs: str | None = default("grid.crs"),
+    targets: int = 1,
     **track_options: Any,
-) -> Recorded:
+) -> Recorded | Group:
     """Recorded tracks in place of a motion model: most to learn from, some to choose by, some held out to evaluate on.
 
     Args:
@@ -173,6 +184,8 @@ def load_tracks(
         cell: see `make_world`; of positions the side of a cell is needed, the others follow from them.
         origin: see `cell`.
         crs: see `cell`.
+        targets: K; above 1 the result is a `Group`, of which so many tracks are followed at once: those whose times
+            overlap, or where the recording has no times any.
         **track_options: those of ``kernel=tracks`` (``trackmdp train kernel=tracks --help``): `format`, `step`,
             `columns` (a dict, or a list as there), `max_gap`, `ends`, `starts`, `held_out`, `validation`, `seed`,
             `min_length`, `markov`.
@@ -192,8 +205,10 @@ def load_tracks(
     if isinstance(named := track_options.get("columns"), Mapping):
         track_options["columns"] = [f"{ours}:{theirs}" for ours, theirs in named.items()]
     words = {"kernel": "tracks", "kernel.path": source} | _words(locals(), track_options)
-    made = make_problem(compose("compare", words), frame=path if in_memory else None)
-    return cast(Recorded, made)
+    of_several = {} if targets == 1 else {"targets.count": targets}
+    cfg = compose("train" if of_several else "compare", words | of_several)
+    made = cast(Recorded, make_problem(cfg, frame=path if in_memory else None))
+    return made if targets == 1 else Group.of_tracks(made, targets)
 
 
 def make_problem(cfg: WorldConfig, *, frame: Any = None) -> Problem:

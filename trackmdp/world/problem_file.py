@@ -8,7 +8,7 @@ A number or a word is an array without axes, an argument with parts has an array
 
 Recorded tracks have `tracks.cells`, `tracks.first`, `tracks.exits` and `tracks.names`, and so do their other two parts.
 An argument that is None has no array: None is its default. A group has the arrays of its first world, with the kernels
-of all kinds as blocks of one matrix, and `members`, the kind of each target.
+of all kinds as blocks of one matrix, or of its recorded tracks; and `members`, the kind of each target.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from trackmdp.errors import UserError
 from trackmdp.untrusted import LARGE, decoded, load_npz, opened
 from trackmdp.world.coverage import Coverage
 from trackmdp.world.files import csr_of, npz_bytes
-from trackmdp.world.group import Group, Subject, one_target
+from trackmdp.world.group import Group, Subject, group_of, one_target
 from trackmdp.world.model import World
 from trackmdp.world.place import Place, place_arrays, place_in
 from trackmdp.world.tracks import Problem, Recorded, Tracks
@@ -49,10 +49,12 @@ def problem_arrays(problem: Subject, classes: Classes | None = None) -> Arrays:
         problem: the world or the recorded tracks.
         classes: `[M]` class of each cell, where a learner was given them (`algo.share_cells`).
     """
-    first = problem.kinds[0] if isinstance(problem, Group) else problem
+    first = problem.single if isinstance(problem, Group) else problem
     given = {field.name: getattr(first, field.name) for field in fields(first)}
     if isinstance(problem, Group):
-        given |= {"kernel": problem.kernel, "members": problem.kind}
+        given["members"] = problem.kind
+        if problem.recorded is None:
+            given["kernel"] = problem.kernel
     return as_arrays({"kind": type(problem).__name__, **given, "classes": classes})
 
 
@@ -89,22 +91,22 @@ def subject_in(stream: BinaryIO) -> Subject:
     """The problem in the content of a `problem.npz`; call it inside `untrusted.decoded`."""
     given = from_arrays(load_npz(stream))
     given.pop("classes", None)
-    if given["kind"] == "Group":
-        return _group(given)
-    problem = _KINDS[given.pop("kind")](**given)
+    kind, members = given.pop("kind"), given.pop("members", None)
+    if kind == "Group" and "tracks" not in given:
+        return _group(given, members)
+    problem = _KINDS["Recorded" if kind == "Group" else kind](**given)
     if isinstance(problem, Recorded):
         for part in (problem.tracks, problem.validation, problem.held_out):
             _check_tracks(part, problem.num_cells)
-    return problem
+    return group_of(problem, len(members)) if kind == "Group" else problem
 
 
-def _group(given: dict[str, Any]) -> Group:
-    """The group of its arguments, without `kind`."""
-    kernel, members = given.pop("kernel"), given.pop("members")
+def _group(given: dict[str, Any], members: npt.NDArray[np.int64]) -> Group:
+    """The group of the arguments of its first world, with the `kernel` of all kinds and the kind of each target."""
+    kernel = given.pop("kernel")
     cells, kinds = math.prod(given["size"]), len(np.unique(members))
     if members.ndim != 1 or kernel.shape[0] != kinds * cells or members.max() != kinds - 1:
         raise ValueError(f"kinds {members.shape} of {kernel.shape[0]} states")
-    del given["kind"]
     blocks = [slice(kind * cells, (kind + 1) * cells) for kind in range(kinds)]
     worlds = [World(kernel[block][:, block], **given) for block in blocks]
     return Group([worlds[kind] for kind in members])
@@ -134,7 +136,8 @@ def _parts(value: Any) -> Mapping[str, Any] | None:
             "shape": matrix.shape,
         }
     if isinstance(value, Tracks):
-        return {name: getattr(value, name) for name in sorted(_TRACKS)}
+        parts = {name: getattr(value, name) for name in sorted(_TRACKS)}
+        return {name: part for name, part in parts.items() if part is not None}
     if isinstance(value, Place):
         return place_arrays(value)
     return value if isinstance(value, Mapping) else None
@@ -161,7 +164,7 @@ def _whole(parts: Arrays) -> Any:
     """A sparse matrix, tracks, a place, or plain counts, whichever has parts of these names."""
     if "indptr" in parts:
         return csr_of(parts)
-    if parts.keys() == _TRACKS:
+    if parts.keys() | {"begins"} == _TRACKS:
         return Tracks(**parts)
     if "corner" in parts:
         return place_in(parts)
@@ -178,6 +181,9 @@ def _check_tracks(tracks: Tracks, num_cells: int) -> None:
     whole = whole and len(tracks) > 0 and bool((tracks.lengths > 0).all())
     if not whole or tracks.first[0] != 0 or tracks.first[-1] != len(tracks.cells):
         raise ValueError("tracks that do not follow each other")
+    begins = tracks.begins
+    if begins is not None and not (begins.shape == tracks.exits.shape and (begins >= 0).all()):
+        raise ValueError(f"begins {begins.shape} of {len(tracks)} tracks")
     if tracks.cells.dtype != np.int64 or tracks.exits.dtype != bool:
         raise ValueError(f"cells of {tracks.cells.dtype}, exits of {tracks.exits.dtype}")
     if not ((tracks.cells >= 0) & (tracks.cells < num_cells)).all():

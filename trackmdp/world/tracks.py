@@ -34,12 +34,14 @@ class Tracks:
         first: `[K + 1]`, where each track begins in `cells`, and P.
         exits: `[K]`, whether the target left the grid after the last cell; if not, the recording stopped there.
         names: `[K]`, the id of each track.
+        begins: `[K]`, the step of the recording's clock at which each begins, from 0; None: all at once.
     """
 
     cells: Indices
     first: Indices
     exits: BoolArray
     names: Indices
+    begins: Indices | None = None
 
     def __len__(self) -> int:
         return len(self.exits)
@@ -53,7 +55,10 @@ class Tracks:
         """The tracks for which `chosen` `[K]` holds."""
         lengths = self.lengths
         cells = self.cells[np.repeat(chosen, lengths)]
-        return Tracks(cells, ends_of(lengths[chosen]), self.exits[chosen], self.names[chosen])
+        begins = None if self.begins is None else self.begins[chosen]
+        return Tracks(
+            cells, ends_of(lengths[chosen]), self.exits[chosen], self.names[chosen], begins
+        )
 
     def limited(self, max_steps: int | None) -> Tracks:
         """The tracks, cut off after `max_steps` steps; None for never."""
@@ -70,13 +75,16 @@ class Tracks:
             ends_of(kept),
             self.exits & (lengths <= max_steps),
             self.names,
+            self.begins,
         )
 
     def closed(self, num_cells: int) -> Tracks:
         """The tracks with the exit, a cell called M, as the last one where the target left."""
         # np.insert takes places in the old array: M goes before the first cell of the next track.
         cells = np.insert(self.cells, self.first[1:][self.exits], num_cells)
-        return Tracks(cells, ends_of(self.lengths + self.exits), self.exits, self.names)
+        return Tracks(
+            cells, ends_of(self.lengths + self.exits), self.exits, self.names, self.begins
+        )
 
     def steps(self, num_cells: int) -> tuple[Indices, Indices]:
         """Cells before and after every step, `[K]` each; M after an exit."""
@@ -87,6 +95,16 @@ class Tracks:
         begins[line.first[1:] - 1] = False
         at = np.flatnonzero(begins)
         return line.cells[at], line.cells[at + 1]
+
+    def kernel(self, num_cells: int) -> sparse.csr_array:
+        """`[M, M]` shares of the moves out of each cell; one more move of each counts as an exit."""
+        start, end = self.steps(num_cells)
+        moved = sparse.coo_array(
+            (np.ones(len(start)), (start, end)), shape=(num_cells, num_cells + 1)
+        )
+        seen = np.bincount(start, minlength=num_cells)
+        share = sparse.diags_array(1.0 / (seen + 1.0)) @ sparse.csr_array(moved)
+        return sparse.csr_array(share[:, :num_cells])
 
     def motion(self, *, anywhere: bool = False) -> Motion:
         """The tracks as a chain of their P points, each followed by the next one with probability 1.
@@ -239,10 +257,13 @@ def _read(path: str | Path, size: tuple[int, int], exits: bool) -> Tracks:
     # Last key first: by track, then by step. Without steps the sort is stable, so that the file's order stays.
     order = np.lexsort((numbers.get("step", np.zeros_like(track)), track))
     track, cell = track[order], cell[order]
-    if "step" in numbers:
-        _check_steps(source, track, numbers["step"][order])
     names, lengths = np.unique(track, return_counts=True)
-    return Tracks(cell, ends_of(lengths), np.full(len(names), exits), names)
+    first, begins = ends_of(lengths), None
+    if "step" in numbers:
+        step = numbers["step"][order]
+        _check_steps(source, track, step)
+        begins = step[first[:-1]] - step.min()
+    return Tracks(cell, first, np.full(len(names), exits), names, begins)
 
 
 def check_tracks(tracks: Tracks, shortest: int, source: str) -> Tracks:

@@ -143,9 +143,11 @@ def _several(
     rule = group_rule(group, policy, cfg.targets.merge)
     found = evaluate_group(rule, width=cfg.evaluation.width, seed=cfg.seed)
     figures, upper = {name: getattr(found, name) for name in FIGURES}, upper_bound(group)
-    apart = None
+    apart, recorded = None, group.recorded
     if rule.tables:  # else it was learned for all targets together
-        apart = len(group) * evaluate(group.kinds[0], policy, per_cell=False).aihtr
+        # On recorded tracks each is in one of the groups, some of which have fewer targets.
+        each = len(group) if recorded is None else len(recorded.held_out) / len(found.totals)
+        apart = each * evaluate(group.single, policy, per_cell=False).aihtr
     report = {"policy": subject, "targets": len(group), "merge": rule.name, "exact": found.exact}
     report |= {"episodes": 0 if found.exact else len(found.totals), "apart": apart, "upper": upper}
     report["expected_length"] = found.expected_length
@@ -153,12 +155,10 @@ def _several(
     write_json(folder / "evaluation.json", report)
     rows = [[name.replace("_", " "), with_ends(each)] for name, each in figures.items()]
     rows += [] if apart is None else [["AIHTR of separate trackers", f"{apart:,.4f}"]]
-    rows.append(["upper bound", f"{upper:,.4f}"])
-    how = "exact" if found.exact else f"{len(found.totals):,} episodes, 95 %"
-    at.print(table(f"{subject}, {len(group)} targets, {rule.name}", ["figure", how], rows))
-    at.print(
-        f"{(upper - found.aihtr.mean) / found.expected_length:.4f} per step below the bound; results in {folder}"
-    )
+    rows += [] if recorded else [["upper bound", f"{upper:,.4f}"]]
+    at.print(table(f"{subject}, {len(group)} targets, {rule.name}", ["figure", found.about], rows))
+    below = f"{(upper - found.aihtr.mean) / found.expected_length:.4f} per step below the bound; "
+    at.print(f"{'' if recorded else below}results in {folder}")
     shown = (cfg.episodes if cfg.log else 0) or _FOR_THE_PICTURE
     episodes = simulate(group, rule, shown, seed=cfg.seed)
     write_text(folder / "picture.txt", draw_picture(episodes[:_FOR_THE_PICTURE], group.task))

@@ -111,12 +111,12 @@ def _show_summary(console: Console, trainer: Learning, run: Run) -> None:
 def _show_several(console: Console, cfg: TrainConfig, several: Several) -> None:
     """The policy for all targets beside the merged optimum of single ones, and the bound."""
     found = several.figures
-    how = "exact" if found.exact else f"{len(found.totals):,} episodes, 95 %"
     merged = "" if cfg.algo.joint else ", merged"
     heads = ["policy", "AIHTR", "reward per step", "accuracy", "sensors per step"]
     rows = several.rows(f"learned ({cfg.algo.name}){merged}")
-    console.print(table(f"{cfg.targets.count} targets, {how}", heads, rows))
-    console.print(several.score.regret)
+    console.print(table(f"{cfg.targets.count} targets, {found.about}", heads, rows))
+    if several.group.recorded is None:
+        console.print(several.score.regret)
 
 
 def _warn(console: Console, trainer: Learning, run: Run, others: Mapping[str, float]) -> None:
