@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from trackmdp.errors import UserError
+
 SIZE_PATTERN = r"[0-9]+(\.[0-9]+)?([KMGT]iB|B)?"
 """Sizes of memory as text: bytes, or with a unit of powers of 1,024."""
 
 _UNITS = {"B": 0, "KiB": 1, "MiB": 2, "GiB": 3, "TiB": 4}
+_LITTLE = 2**26
+"""Bytes up to which the system is not asked: that takes a tenth of a millisecond."""
 _CGROUPS = (
     ("memory.max", "memory.current", "inactive_file"),
     ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
@@ -40,6 +44,23 @@ def free_bytes(root: Path = Path("/")) -> int:
             if most is not None and now is not None:
                 free.append(most - now + (_entry(folder / "memory.stat", cache, 1) or 0))
     return min((each for each in free if each is not None), default=2**63)
+
+
+def check_free(what: str, needed: float) -> None:
+    """See that so many bytes are free, before any of them is asked for.
+
+    Without it a system that promises more than it has (Linux does) kills the process, or another one, and no message
+    is left.
+
+    Args:
+        what: the option, for messages.
+        needed: bytes, at the least.
+
+    Raises:
+        UserError: they are not.
+    """
+    if needed > _LITTLE and needed > (free := free_bytes()):
+        raise UserError(f"{what}: needs about {gib(needed)}, {gib(free)} are available")
 
 
 def _entry(file: Path, name: str, unit: int) -> int | None:

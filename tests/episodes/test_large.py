@@ -9,13 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import trackmdp as tm
 from tests.episodes.browser import CHROMIUM, Browser
+from trackmdp import machine
 from trackmdp.app.cli import main
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.episode_page import PAGE_WIDE
 from trackmdp.episodes.extracts import write_page
 from trackmdp.episodes.player import WIDE, frame
 from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.errors import UserError
 from trackmdp.world.make import make_world
 from trackmdp.world.model import Task
 from trackmdp.world.render import around
@@ -148,3 +151,25 @@ def test_a_small_grid_is_drawn_whole() -> None:
     object.__setattr__(episode, "misses", np.array([0]))
     lines = frame(episode, 0, world.task).splitlines()
     assert len(lines) == 6 and lines[2] == "│   ●     │"
+
+
+def test_an_episode_that_does_not_fit_is_refused_before_its_layers_are_made(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with EpisodeReader(folder / "episodes.mcap") as reader:
+        world, row = reader.world(), reader.row(0)
+        # Belief and policy are numbers of 4 bytes, the action one of 1.
+        needed = row["length"] * 3000 * 9
+        made = tm.simulate(world, reader.policy(0), 1)
+        free = needed
+        monkeypatch.setattr(machine, "_LITTLE", 0)
+        monkeypatch.setattr(machine, "free_bytes", lambda: free)
+        assert len(reader.read(0)) == row["length"]
+        free = needed - 1
+        with pytest.raises(UserError, match=rf"{row['length']} steps on 3,000 cells: needs about"):
+            reader.read(0)
+        free = len(made[0]) * 3000 * 9
+        assert len(list(made.complete())) == 1
+        free -= 1
+        with pytest.raises(UserError, match="steps on 3,000 cells: needs about"):
+            list(made.complete())

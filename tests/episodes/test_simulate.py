@@ -303,7 +303,7 @@ def test_a_number_of_episodes_that_is_none_is_refused(episodes: Any) -> None:
 
 @pytest.mark.parametrize("problem", [WORLD, Group([WORLD, WORLD])])
 def test_episodes_that_do_not_fit_are_refused_before_any_is_kept(problem: Any) -> None:
-    with pytest.raises(UserError, match=r"episodes=1000000000 need about [0-9.,]+ GiB"):
+    with pytest.raises(UserError, match=r"episodes=1000000000: needs about [0-9.,]+ GiB"):
         simulate(problem, "none", 10**9)
 
 

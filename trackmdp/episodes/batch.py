@@ -17,6 +17,7 @@ from tensordict import TensorDict
 
 from trackmdp.episodes.belief_filter import beliefs
 from trackmdp.episodes.episode import Episode, Floats, Integers, last_cells
+from trackmdp.episodes.grids import check_layers
 from trackmdp.episodes.showing import Showing
 from trackmdp.notebook.card import Card, decimal, grid_words, percent
 from trackmdp.policies.policy import Policy
@@ -225,6 +226,7 @@ class Episodes(Showing, Sequence[Episode]):
 
     def _completed(self, some: Sequence[Episode]) -> Iterator[Episode]:
         """See `complete`."""
+        check_layers(sum(map(len, some)), self.problem.num_cells)
         if (world := self.problem.model) is None:
             found = [np.zeros((len(each), self.problem.num_cells), np.float32) for each in some]
         else:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeAlias
 
@@ -15,6 +16,7 @@ import numpy.typing as npt
 
 from trackmdp.episodes.episode import Episode, Floats
 from trackmdp.episodes.schema import clock_of, json_bytes
+from trackmdp.machine import check_free
 from trackmdp.world.model import BoolArray
 
 WHOLE_CELLS = 64 * 64
@@ -23,6 +25,11 @@ WHOLE_CELLS = 64 * 64
 PART, _STEP = 25, 9
 """Rows and columns that a viewer shows of a larger grid, and how far that part moves at once: it stays where it is
 while the target does not leave 9 x 9 cells."""
+
+_EACH = 4 + 4 + 1
+"""Bytes of belief, policy and action of a cell in a step."""
+_AT_ONCE = 2**22
+"""Numbers of a layer that are made together, of several steps."""
 
 Box: TypeAlias = tuple[int, int, int, int]
 """Top, bottom, left and right, ends excluded."""
@@ -65,27 +72,48 @@ def grid_messages(
     `covered` `[T, M]` are the cells that the sensors on see; None where each sees its own.
     """
     rows, columns = size
-    cells = np.zeros((len(episode), rows, columns), _CELL)
-    cells["belief"] = np.asarray(episode.belief).reshape(cells.shape)
-    cells["policy"] = np.asarray(episode.probability).reshape(cells.shape)
-    active = (episode.action if covered is None else covered).reshape(cells.shape)
-    whole = np.broadcast_to(True, cells.shape)
-    used = whole if rows * columns <= WHOLE_CELLS else (cells["belief"] > 0) | (cells["policy"] > 0)
-    sensed = active.view(np.uint8)
     exited = (episode.target == rows * columns).astype(int).tolist()
     at = np.stack(np.divmod(episode.target % (rows * columns), columns), axis=1).tolist()
-    boxes = zip(boxes_of(used), boxes_of(active), at, _parts(episode, size), strict=True)
-    for t, (box, active_box, (row, column), (y, x)) in enumerate(boxes):
+    layers = _layers(episode, size, episode.action if covered is None else covered)
+    steps = enumerate(zip(layers, at, _parts(episode, size), strict=True))
+    for t, ((cells, active), (row, column), (y, x)) in steps:
         stamp = stamp_of(first_tick + t)
         yield {
-            "/grid": boxed(stamp, _GRID_SAYS, cells[t], box, 0),
-            "/active": boxed(stamp, _ACTIVE_SAYS, sensed[t], active_box, 0.01),
+            "/grid": boxed(stamp, _GRID_SAYS, *cells, 0),
+            "/active": boxed(stamp, _ACTIVE_SAYS, *active, 0.01),
             # half as wide as its cell, so that the layers beneath it show: in column 3 from x = 3.25 to 3.75
             "/target": grid_text(
                 stamp, _TARGET_SAYS, _DOT[exited[t]], column + 0.25, rows - row - 0.75, 0.02
             ),
             "/part": part_text(stamp, x, rows - y),
         }
+
+
+_Layer: TypeAlias = tuple[npt.NDArray[Any], Box]
+
+
+def _layers(
+    episode: Episode, size: tuple[int, int], active: BoolArray
+) -> Iterator[tuple[_Layer, _Layer]]:
+    """Of each step belief and policy `[R, C]`, and the cells sensed, each with the box to be written."""
+    assert episode.belief is not None
+    assert episode.probability is not None
+    # A few steps at a time: of all steps together they would take 12 bytes for each step and cell.
+    each = max(1, _AT_ONCE // math.prod(size))
+    for begin in range(0, len(episode), each):
+        some = slice(begin, begin + each)
+        sensed = active[some].reshape(-1, *size)
+        cells = np.zeros(sensed.shape, _CELL)
+        cells["belief"] = episode.belief[some].reshape(cells.shape)
+        cells["policy"] = episode.probability[some].reshape(cells.shape)
+        whole = np.broadcast_to(True, cells.shape)
+        used = (cells["belief"] > 0) | (cells["policy"] > 0)
+        boxes = boxes_of(whole if math.prod(size) <= WHOLE_CELLS else used)
+        yield from zip(
+            zip(cells, boxes, strict=True),
+            zip(sensed.view(np.uint8), boxes_of(sensed), strict=True),
+            strict=True,
+        )
 
 
 def stamp_of(tick: int) -> bytes:
@@ -155,12 +183,22 @@ def read_grids(grids: Sequence[bytes], size: tuple[int, int]) -> tuple[Floats, F
         ValueError, KeyError, TypeError: one is none of a grid of `size`.
     """
     rows, columns = size
+    check_layers(len(grids), rows * columns)
     # zeros and not one block: only written parts take memory, however many steps a log claims
     belief, policy = (np.zeros((len(grids), rows, columns), np.float32) for _ in range(2))
     for t, text in enumerate(grids):
         place, cells = read_grid(text, size, _CELL)
         belief[t][place], policy[t][place] = cells["belief"], cells["policy"]
     return belief.reshape(len(grids), -1), policy.reshape(len(grids), -1)
+
+
+def check_layers(steps: int, cells: int) -> None:
+    """See that belief, policy and action of an episode fit into free memory.
+
+    Raises:
+        UserError: they do not fit.
+    """
+    check_free(f"an episode of {steps:,} steps on {cells:,} cells", _EACH * steps * cells)
 
 
 def read_grid(

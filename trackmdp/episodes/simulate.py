@@ -18,7 +18,7 @@ from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.episode_draws import Draws
 from trackmdp.episodes.group_episodes import GroupEpisodes
 from trackmdp.errors import UserError
-from trackmdp.machine import free_bytes, gib
+from trackmdp.machine import check_free
 from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import PolicyLike
 from trackmdp.seeding import derive, preserved_global_rng
@@ -94,7 +94,9 @@ def simulate(
         return resimulate(cast(Any, problem), policy, episode_seeds(seed, count, *names))
 
     if episodes > _MANY:
-        _check_room(episodes, first(_TRIED))
+        tried = first(_TRIED)
+        each = _COPIES * tried.nbytes / _TRIED + _SEED
+        check_free(f"simulate: episodes={episodes}", episodes * each)
     made: Episodes | GroupEpisodes = first(episodes)
     return made
 
@@ -103,19 +105,6 @@ _MANY, _TRIED = 2**16, 64
 """Episodes from which on the memory is looked at first; and simulated for that."""
 _COPIES, _SEED = 2, 44
 """Times that the steps are held while their parts are joined; bytes of an episode's seed."""
-
-
-def _check_room(episodes: int, tried: Episodes | GroupEpisodes) -> None:
-    """See that many episodes fit into free memory, by the size of a few.
-
-    Raises:
-        UserError: they do not fit.
-    """
-    needed, free = episodes * (_COPIES * tried.nbytes / len(tried) + _SEED), free_bytes()
-    if needed > free:
-        raise UserError(
-            f"simulate: episodes={episodes} need about {gib(needed)}, {gib(free)} are available"
-        )
 
 
 def episode_seeds(seed: int, episodes: int, *names: str | int) -> list[int]:

@@ -15,8 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.errors import UserError
-from trackmdp.machine import free_bytes, gib
+from trackmdp.machine import check_free
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.choose import Decisions
 from trackmdp.solvers.linear import DIRECT_CELLS, TOLERANCE, IndexArray, RenewalSystem, per_row
@@ -240,10 +239,8 @@ def check_room(task: Task, motion: Motion, events: Events) -> None:
     keys = events.keys
     if keys.num_classes == motion.modes == 1 or motion.ends is not None:
         return  # cells alone: large grids are searched region by region; on tracks no two paths meet
-    needed, free = _step_bytes(motion, task.num_choices) * len(events.codes), free_bytes()
-    if needed > free:
-        memory = f"task.memory={keys.memory} with {motion.modes} modes"
-        raise UserError(f"{memory}: needs about {gib(int(needed))}, {gib(free)} are available")
+    needed = _step_bytes(motion, task.num_choices) * len(events.codes)
+    check_free(f"task.memory={keys.memory} with {motion.modes} modes", needed)
 
 
 def _step_bytes(motion: Motion, choices: int) -> float:

@@ -15,7 +15,7 @@ from scipy import sparse
 from trackmdp.config.sensors import LARGEST_PRICE
 from trackmdp.config.world import MEMORIES
 from trackmdp.errors import UserError
-from trackmdp.machine import free_bytes, gib
+from trackmdp.machine import check_free
 from trackmdp.notebook.card import Card, Carded, Facts, grid_words, span
 from trackmdp.world.coverage import Coverage
 from trackmdp.world.kernel_checks import (
@@ -525,10 +525,7 @@ TASK_BYTES = 24
 
 
 def check_fits(key: str, size: Size, cell_bytes: int) -> None:
-    """See that a grid fits into free memory, before any of it is asked for.
-
-    Without it a system that promises more than it has (Linux does) kills the process, or another one, and no message
-    is left.
+    """See that a grid fits into free memory; see `check_free`.
 
     Args:
         key: the option or argument, for messages.
@@ -538,9 +535,7 @@ def check_fits(key: str, size: Size, cell_bytes: int) -> None:
     Raises:
         UserError: it does not fit.
     """
-    needed, free = math.prod(grid_size(size)) * cell_bytes, free_bytes()
-    if needed > free:
-        raise UserError(f"{key}={size}: needs about {gib(needed)}, {gib(free)} are available")
+    check_free(f"{key}={size}", math.prod(grid_size(size)) * cell_bytes)
 
 
 def _price(name: str, value: float, most: float = LARGEST_PRICE) -> float:
