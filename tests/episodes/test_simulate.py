@@ -16,12 +16,12 @@ from tests.episodes.logs import WORLD, policy, recorded
 from tests.helpers import hop_world, limited, random_kernel, small_world
 from tests.tracks import by_hand
 from tests.tracks import recorded as recorded_tracks
-from trackmdp.episodes.belief_filter import BeliefFilter
 from trackmdp.episodes.episode import Episode, first_difference
 from trackmdp.episodes.simulate import episode_seeds, resimulate, simulate
 from trackmdp.errors import UserError
 from trackmdp.policies import policy as policies
 from trackmdp.policies.acting import Playback
+from trackmdp.policies.belief import BeliefFilter
 from trackmdp.policies.policy import Policy
 from trackmdp.seeding import derive
 from trackmdp.world.dynamics import Dynamics
@@ -143,15 +143,12 @@ def test_the_belief_is_the_filters(name: str) -> None:
     exact = BeliefFilter(WORLD.kernel)
     for episode in together(name)[:10]:
         assert episode.belief is not None
-        belief = exact.detect(torch.tensor([episode.start]))
+        belief = exact.detect(np.array([episode.start]))
         for t in range(len(episode)):
             predicted = exact.predict(belief)
-            np.testing.assert_allclose(
-                episode.belief[t], predicted[0].numpy(), rtol=1e-6, atol=1e-9
-            )
-            action = torch.as_tensor(episode.action[t : t + 1])
-            found = torch.tensor([int(episode.target[t])])
-            belief = exact.detect(found) if episode.located[t] else exact.miss(predicted, action)
+            np.testing.assert_allclose(episode.belief[t], predicted[0], rtol=1e-6, atol=1e-9)
+            action, target = episode.action[t : t + 1], episode.target[t : t + 1]
+            belief = exact.detect(target) if episode.located[t] else exact.miss(predicted, action)
 
 
 def test_by_hand() -> None:

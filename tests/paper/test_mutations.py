@@ -10,10 +10,10 @@ import pytest
 
 from tests.helpers import headings
 from tests.solvers.worlds import paper_world
-from trackmdp.episodes.belief_filter import BeliefFilter
 from trackmdp.paper import histories, proofs, theorems
 from trackmdp.paper.check import Check
 from trackmdp.paper.corner import changed, corner, dearer
+from trackmdp.policies.belief import BeliefFilter
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, estimator, hidden, known, optimal, pomdp, rules
 from trackmdp.solvers.branch import Tree
@@ -105,7 +105,7 @@ def forgetful(patch: Patch) -> None:
     patch.setattr(
         BeliefFilter,
         "miss",
-        lambda self, predicted, action: predicted / predicted.sum(-1, keepdim=True),
+        lambda self, predicted, action: predicted / predicted.sum(-1, keepdims=True),
     )
 
 

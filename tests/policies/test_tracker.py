@@ -213,7 +213,7 @@ def test_its_belief_is_that_of_the_log(name: str) -> None:
         start = episode.start_mode if known else None
         tracker = policy.tracker(episode.start, mode=start, world=world)
         for t in range(len(episode)):
-            moved = world.kernel.T @ tracker._belief.states
+            moved = world.kernel.T @ tracker._belief[0]
             assert episode.belief[t] == pytest.approx(moved.reshape(-1, modes).sum(1), abs=1e-6)
             assert tracker.belief().sum() == pytest.approx(1)
             tracker.sensors()

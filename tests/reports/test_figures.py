@@ -69,7 +69,7 @@ def test_the_numbers_of_a_figure_are_those_of_the_runs(grouped: Study, panel: Pa
     assert rows["Q_MDP"][2:] == [runs[0].references["Q_MDP"]["aihtr"], None, None, None]
     assert rows["printed bound"][2] == runs[0].references["printed bound"]["aihtr"]
     assert rows["all on"][2] == runs[0].references["all on"]["aihtr"]
-    assert "n = 3 seeds" in figure.title
+    assert "n = 3 seeds" in figure.table.caption
 
 
 def test_learned_policies_lie_over_the_frontier_of_the_solved_ones() -> None:
@@ -209,7 +209,7 @@ def test_the_same_figure_has_the_same_bytes_and_no_date(grouped: Study, panel: P
 
 
 def test_letters_that_the_font_lacks_stay_letters_without_a_warning() -> None:
-    made = draw_figure("title", EMPTY, 1.0, lambda figure: figure.text(0.5, 0.5, "a\tb \u65e5"))
+    made = draw_figure(EMPTY, 1.0, lambda figure: figure.text(0.5, 0.5, "a\tb \u65e5"))
     assert "a\tb \u65e5" in made.svg.decode()
 
 
@@ -219,7 +219,7 @@ def test_in_the_page_a_figure_has_a_name_its_numbers_and_the_colours_of_the_page
     figure = drawn(grouped, panel, "regret")
     text = figure.html()
     assert re.search(
-        rf'role="img" viewBox="[^"]+"[^>]* aria-label="{re.escape(figure.title)}"', text
+        rf'role="img" viewBox="[^"]+"[^>]* aria-label="{re.escape(figure.table.caption)}"', text
     )
     drawing = text[: text.index("<figcaption>")]
     assert not re.findall(r"#[0-9a-f]{6}", drawing), "a colour that does not change with the scheme"
@@ -230,7 +230,7 @@ def test_in_the_page_a_figure_has_a_name_its_numbers_and_the_colours_of_the_page
 
 def test_every_colour_of_the_files_is_one_of_the_page() -> None:
     looks = [*LOOKS, *REFERENCES.values()]
-    assert {look.colour for look in looks} <= PALETTE.keys()
+    assert {look.color for look in looks} <= PALETTE.keys()
     page = files("trackmdp.reports").joinpath("report.html").read_text(encoding="utf-8")
     for name in PALETTE.values():
         assert len(re.findall(rf"--{name}: #", page)) == 2, (
@@ -241,11 +241,9 @@ def test_every_colour_of_the_files_is_one_of_the_page() -> None:
 @pytest.mark.parametrize("count", [3, 8, 20])
 def test_every_method_has_a_colour_and_a_mark_of_its_own(count: int) -> None:
     looks = looks_of([f"method {number}" for number in range(count)])
-    assert len({(look.colour, look.line) for look in looks.values()}) == min(count, 16)
+    assert len({(look.color, look.linestyle) for look in looks.values()}) == min(count, 16)
     first = [*looks.values()][:8]
-    assert (
-        len({look.colour for look in first}) == len({look.marker for look in first}) == len(first)
-    )
+    assert len({look.color for look in first}) == len({look.marker for look in first}) == len(first)
 
 
 @pytest.mark.parametrize("letters", [3, 15, 30, 120])
@@ -260,7 +258,7 @@ def test_a_legend_lies_below_the_axes_and_within_the_figure(letters: int) -> Non
         assert box.y1 <= axes.get_window_extent().y0
         assert box.x0 >= 0 and box.x1 <= figure.bbox.x1
 
-    draw_figure("title", EMPTY, 3.3, paint)
+    draw_figure(EMPTY, 3.3, paint)
 
 
 def test_without_matplotlib_one_line_names_the_extra(

@@ -49,7 +49,7 @@ def test_a_map_of_averaged_plans_fills_the_share_of_each_cell() -> None:
     each = by_hand(np.array([[0.0, 0.25], [0.0, 1.0]]), kernel, (1, 2), averaged=True)
     figure = maps.policy_map("x", each)
     assert [row[2:4] for row in figure.table.rows] == [[0.25, 2], [1.0, 1]]
-    assert "shares of the detections" in figure.title
+    assert "shares of the detections" in figure.table.caption
 
 
 def test_a_map_of_values_shows_the_distance_from_the_bound(drawn: list[Mapped]) -> None:
@@ -98,7 +98,7 @@ def test_a_large_grid_is_drawn_as_means_over_tiles(monkeypatch: pytest.MonkeyPat
     assert [row[2] for row in sets.table.rows] == pytest.approx(number.ravel())
     assert [row[3] for row in sets.table.rows] == [1.0] * 6
     assert sets.table.rows[4][:2] == [4, 4]
-    assert "tiles of 3 x 3 cells" in sets.title
+    assert "tiles of 3 x 3 cells" in sets.table.caption
     values = maps.missing_map("x", [each], maps.shades([maps.missing([each])]))
     assert [row[2:] for row in values.table.rows] == [[0.5]] * 6  # Q_MDP was not valued
     assert idea_figure(each) is None  # no motion is kept

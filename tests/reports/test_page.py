@@ -124,7 +124,7 @@ def test_every_figure_has_a_name_its_numbers_and_its_n(report: Report) -> None:
     names = re.findall(r'<svg class="chart" role="img"[^>]* aria-label="([^"]+)"', text)
     assert len(names) == len(report.figures) == text.count("<figure ")
     for figure in report.figures:
-        assert re.search(r"\bn = \d", figure.title), figure.table.name
+        assert re.search(r"\bn = \d", figure.table.caption), figure.table.name
         assert figure.table.rows
 
 

@@ -31,7 +31,7 @@ def drawn(low: float, high: float, scale: str = "log", values: list[float] | Non
         tidy(axes)
         made.append(axes)
 
-    draw_figure("title", TABLE, 3.3, paint)
+    draw_figure(TABLE, 3.3, paint)
     # The SVG is drawn at another resolution, and sizes of texts are kept from there.
     made[0].figure.draw_without_rendering()  # type: ignore[union-attr]
     return made[0]

@@ -14,6 +14,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from trackmdp.policies.belief import BeliefFilter
 from trackmdp.solvers.pomdp import FiniteMdp
 from trackmdp.world.model import Array, BoolArray, World
 
@@ -121,17 +122,12 @@ def advantage(solved: HistoryQ, state: State, j: int) -> float:
 
 def filtered(solved: HistoryQ, state: State) -> Array:
     """`[M]` the belief filter's prediction of the next cell."""
-    import torch  # only here: solving needs none
-
-    from trackmdp.episodes.belief_filter import BeliefFilter
-
     x, history = state
-    filter_ = BeliefFilter(solved.world.kernel)
-    predicted = filter_.predict(filter_.detect(torch.tensor([x])))
+    exact = BeliefFilter(solved.world.kernel)
+    predicted = exact.predict(exact.detect(np.array([x])))
     for number in history:
-        action = torch.as_tensor(solved.actions[number])[None]
-        predicted = filter_.predict(filter_.miss(predicted, action))
-    return np.asarray(predicted[0].numpy())
+        predicted = exact.predict(exact.miss(predicted, solved.actions[number][None]))
+    return predicted[0]
 
 
 def miss_losses(solved: HistoryQ) -> Iterator[tuple[float, float]]:

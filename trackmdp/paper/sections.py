@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from typing import Any
 
 import numpy as np
@@ -55,7 +55,7 @@ def calibration_figure(every: Sequence[Candidate]) -> Figure:
                 [c.deviation for c in mine],
                 height,
                 ".",
-                color=style.colour,
+                color=style.color,
                 markersize=4,
                 alpha=0.7,
             )
@@ -75,7 +75,7 @@ def calibration_figure(every: Sequence[Candidate]) -> Figure:
         tidy(axes)
 
     title = f"Candidate kernels by their distance to the printed Q_MDP accuracy, n = {len(every) // 3} for each Z"
-    return draw_figure(title, candidates_table(every), 2.8, paint)
+    return draw_figure(replace(candidates_table(every), caption=title), 2.8, paint)
 
 
 def fit_table(settings: Sequence[Setting]) -> Table:
@@ -148,7 +148,7 @@ def _ranges(
             _draw_range(axes, np.array(spreads).T, np.arange(len(rows)) + offset, support_size)
             if printed:
                 look: Any = {
-                    "color": COLOURS[support_size].colour,
+                    "color": COLOURS[support_size].color,
                     "linewidth": 0.8,
                     "linestyle": ":",
                 }
@@ -169,7 +169,7 @@ def _ranges(
         [s.border, s.t_max, s.support_size, *astuple(of(s))] for s in settings
     ]
     table = Table(f"sensitivity-{name}", title, columns, numbers)
-    return draw_figure(title, table, 4.2, paint)
+    return draw_figure(table, 4.2, paint)
 
 
 def _draw_range(axes: Axes, spread: Array, y: ArrayLike, support_size: int) -> None:
@@ -178,7 +178,7 @@ def _draw_range(axes: Axes, spread: Array, y: ArrayLike, support_size: int) -> N
     # `[2, settings]`, lengths below and above the median. The range, not a confidence interval: how far the draw of
     # the kernel moves a figure.
     bars = np.stack([middle - low, high - middle])
-    points: Any = {"fmt": look.marker, "color": look.colour, "markersize": 3.5, "elinewidth": 1.2}
+    points: Any = {"fmt": look.marker, "color": look.color, "markersize": 3.5, "elinewidth": 1.2}
     axes.errorbar(middle, y, xerr=bars, label=f"Z = {support_size}", **points)
 
 

@@ -1,72 +1,70 @@
-"""Where one target may be: the exact belief filter, step by step, in NumPy."""
+"""The POMDP's exact belief filter (paper, eq. belief_up, with the indices of the process as it runs), in NumPy."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
+from scipy import sparse
 
-from trackmdp.errors import UserError
 from trackmdp.world.model import Array
 
+IndexArray: TypeAlias = npt.NDArray[np.int64]
 
-class Belief:
-    """Probability of each hidden state of a target that is known to be in the grid.
 
-    State z is cell z // H and mode z % H, with H modes.
+class BeliefFilter:
+    """Belief over the hidden states of targets known to be in the grid: `[B, Z]` rows that sum to 1.
+
+    State z is cell z // H and mode z % H, with H modes. One step is `predict`, then `detect` or `miss`. All methods are
+    pure, and a row is the same to the bit for any other rows.
 
     Args:
-        world: its motion.
-        cell: in which it was located.
-        mode: its mode there, where a detection gives it; None: all are equally likely.
-
-    Attributes:
-        states: `[Z]`, of sum 1.
+        kernel: `[Z, Z]` moves of the states.
+        modes: H.
     """
 
-    states: Array
+    def __init__(self, kernel: sparse.csr_array, modes: int = 1) -> None:
+        self._into = kernel.T.tocsr()  # entry (y, x): from x into y
+        self._modes, self._state = modes, np.arange(kernel.shape[0])
 
-    def __init__(self, world: Any, cell: int, mode: int | None) -> None:
-        self._into = world.kernel.T.tocsr()  # entry (y, x): from x into y
-        self._modes = world.kernel.shape[0] // world.num_cells
-        self.states = self._mask(cell, mode) / self._mask(cell, mode).sum()
+    def cells(self, belief: Array) -> Array:
+        """`[B, M]` probability of each cell."""
+        found: Array = belief.reshape(len(belief), -1, self._modes).sum(axis=2)
+        return found
 
-    @property
-    def cells(self) -> Array:
-        """`[M]` probability of each cell."""
-        return self.states.reshape(-1, self._modes).sum(axis=1)
+    def detect(
+        self, cell: IndexArray, mode: IndexArray | None = None, predicted: Array | float = 1.0
+    ) -> Array:
+        """Condition `predicted` `[B, Z]`, by default every state alike, on a detection.
 
-    def restore(self, states: Any) -> None:
-        """Go on from the `states` of an earlier belief, as a list.
-
-        Raises:
-            UserError: they are not as many probabilities.
+        In `cell` `[B]`, and in `mode` `[B]` where a detection gives it. Where it cannot have happened, every state that
+        it leaves is as likely.
         """
-        found = np.array(states if isinstance(states, list) else [], dtype=np.float64)
-        if found.shape != self.states.shape or not (found >= 0).all() or not 0 < found.sum() < 1.1:
-            raise UserError(f"state: belief, expected {len(self.states)} probabilities")
-        self.states = found
-
-    def missed(self, reported: Array) -> None:
-        """A move without a report; `reported` `[M]` is the probability of a report from each cell."""
-        moved = self._into @ self.states
-        self._condition(moved * (1.0 - np.repeat(reported, self._modes)), moved)
-
-    def located(self, cell: int, mode: int | None) -> None:
-        """A move into a cell, in which the target was located."""
-        mask = self._mask(cell, mode)
-        self._condition((self._into @ self.states) * mask, mask)
-
-    def _condition(self, weight: Array, otherwise: Array) -> None:
-        """Scale to sum 1; where the observation cannot have happened, the fallback stands in."""
-        chosen = weight if weight.sum() > 0 else otherwise
-        self.states = chosen / chosen.sum()
-
-    def _mask(self, cell: int, mode: int | None) -> Array:
-        """`[Z]` 1 in the states of a cell, or in the one of cell and mode."""
-        mask = np.zeros(self._into.shape[0])
-        begin = cell * self._modes
-        mask[begin : begin + self._modes] = mode is None
+        mask = self._state // self._modes == cell[:, None]
         if mode is not None:
-            mask[begin + mode] = 1.0
-        return mask
+            mask &= self._state % self._modes == mode[:, None]
+        return _conditioned(predicted * mask, mask)
+
+    def predict(self, belief: Array) -> Array:
+        """Predicted probability of each state after one move; a row sums to the probability of no exit."""
+        # Sparse: a product of dense matrices may add up in another order for one row than for many, which would make
+        # an episode differ in the last bit when it is simulated again alone.
+        return np.ascontiguousarray((self._into @ np.ascontiguousarray(belief.T)).T)
+
+    def miss(self, predicted: Array, report: npt.NDArray[Any]) -> Array:
+        """Condition `predicted` `[B, Z]` on no detection and no exit.
+
+        `report` `[B, M]` is the probability of a report from each cell: whether a sensor is on, or p_d of one that may
+        miss. Where that event has probability zero the prediction stands in, normalised over the grid: the observation
+        cannot have happened, and the belief stays finite.
+        """
+        unseen = predicted * (1.0 - np.repeat(report, self._modes, axis=1))
+        return _conditioned(unseen, predicted)
+
+
+def _conditioned(weight: Array, otherwise: npt.NDArray[Any]) -> Array:
+    """Rows scaled to sum 1; a row of zeros is replaced by that of `otherwise`."""
+    chosen = np.where(weight.sum(axis=1, keepdims=True) > 0, weight, otherwise)
+    # The least number keeps 0 / 0 out, of a target that has certainly left.
+    return chosen / np.maximum(chosen.sum(axis=1, keepdims=True), np.finfo(np.float64).tiny)

@@ -11,7 +11,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from trackmdp.errors import UserError
-from trackmdp.policies.belief import Belief
+from trackmdp.policies.belief import BeliefFilter
 from trackmdp.policies.onnx_table import OnnxTable
 from trackmdp.policies.saved import load_policy
 from trackmdp.policies.table import PolicyTable
@@ -79,7 +79,8 @@ class Tracker:
         self._key, self._misses, self._steps = 0, 0, 0
         self._on: list[int] | None = None
         self._exited = False
-        self._belief: Belief | None = None
+        self._filter = None if world is None else BeliefFilter(world.kernel, world.modes)
+        self._belief: Array = np.zeros((1, 0))  # [1, Z] where the motion is known
         self._seed = _number("tracker: seed", seed)
         found = self._one("tracker", cell, at)
         if found is None:
@@ -139,9 +140,9 @@ class Tracker:
             UserError: the motion is not known, or the target has exited.
         """
         self._check_followed("belief()")
-        if self._belief is None:
+        if self._filter is None:
             raise UserError("belief(): the motion is not known, expected tracker(..., world=...)")
-        return self._belief.cells
+        return self._filter.cells(self._belief)[0]
 
     def sees(self, cell: int) -> bool:
         """Whether a sensor that is on covers a cell; the safe action does everywhere. None is on before `sensors()`.
@@ -185,9 +186,10 @@ class Tracker:
         if cell is None:
             if mode is not None:
                 raise UserError(f"report: mode={mode} without a cell, expected none")
-            if self._belief is not None:
+            if self._filter is not None:
                 chance = self._world.safe_detection if self.safe else self._world.detection
-                self._belief.missed(self._seen() * chance)
+                predicted = self._filter.predict(self._belief)
+                self._belief = self._filter.miss(predicted, (self._seen() * chance)[None])
             # The clock stands still where the safe action misses.
             self._misses = min(self._misses + 1, self._task.num_choices)
         else:
@@ -207,7 +209,7 @@ class Tracker:
     def state(self) -> dict[str, Any]:
         """All that is needed to go on later, as JSON takes it; see `restore`."""
         numbers = {name: getattr(self, f"_{name}") for name in _NUMBERS}
-        belief = None if self._belief is None else self._belief.states.tolist()
+        belief = None if self._filter is None else self._belief[0].tolist()
         own = {"on": self._on, "exited": self._exited, "belief": belief}
         return {"task": self._facts(), **numbers, **own}
 
@@ -237,8 +239,12 @@ class Tracker:
             raise UserError("state: expected a list or None as on, True or False as exited")
         tracker._on = None if on is None else [_number("state: on", each, last) for each in on]
         tracker._exited = state["exited"]
-        if tracker._belief is not None:
-            tracker._belief.restore(state["belief"])
+        if tracker._filter is not None:
+            belief, states = state["belief"], tracker._belief.shape[1]
+            found = np.array([belief if isinstance(belief, list) else []], dtype=np.float64)
+            if found.shape[1] != states or (found < 0).any() or not 0 < found.sum() < 1.1:
+                raise UserError(f"state: belief, expected {states} probabilities")
+            tracker._belief = found
         return tracker
 
     def _facts(self) -> dict[str, Any]:
@@ -274,10 +280,10 @@ class Tracker:
         before = np.int64(self._key)
         key = keys.start(place, own) if first else keys.next(before, self._misses, place, own)
         self._key, self._misses = int(key), 0
-        if first and self._world is not None:
-            self._belief = Belief(self._world, int(place), mode)
-        elif self._belief is not None:
-            self._belief.located(int(place), mode)
+        if self._filter is not None:
+            told = None if mode is None else np.array([mode])
+            predicted = 1.0 if first else self._filter.predict(self._belief)
+            self._belief = self._filter.detect(np.array([place]), told, predicted)
 
     def _chosen(self) -> list[int]:
         """The policy's own choice, before any safe action."""

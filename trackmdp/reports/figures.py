@@ -22,7 +22,7 @@ from trackmdp.reports.style import (
     looks_of,
     tidy,
 )
-from trackmdp.reports.tables import Cell, Column, Table
+from trackmdp.reports.tables import Cell, Column, Table, interval_columns
 from trackmdp.reports.ticks import label_values
 from trackmdp.statistics import MeanInterval, mean_over_groups, share
 from trackmdp.world.model import Array
@@ -47,15 +47,6 @@ class Line:
     look: Look
     x: Sequence[float]
     row: Sequence[MeanInterval]
-
-    @property
-    def ends(self) -> Array:
-        """`[3, K]` means, lower and upper ends of the intervals; without an interval all three are the mean."""
-        known = [
-            (e.mean, e.mean if e.low is None else e.low, e.mean if e.high is None else e.high)
-            for e in self.row
-        ]
-        return np.array(known).T
 
 
 def _line_figure(
@@ -90,23 +81,24 @@ def _line_figure(
             # Around the true position, where exact lines stand: three are shifted by -1, 0 and 1 times `shift`.
             moved = shift * (place - (learned - 1) / 2) if place < learned else 0.0
             x = np.asarray(line.x) + moved
-            mean, low, high = np.maximum(line.ends, floor)
+            # `[3, K]`; without an interval, None, its ends are the mean.
+            ends = np.array([(each.mean, each.low, each.high) for each in line.row], dtype=float).T
+            mean, low, high = np.maximum(np.where(np.isnan(ends), ends[0], ends), floor)
             marks = (2 * place % thin, thin) if thin > 1 else None
-            axes.plot(x, mean, label=line.name, markevery=marks, **line.look.of_line())
-            axes.fill_between(x, low, high, color=line.look.colour, alpha=0.18, linewidth=0)
+            axes.plot(x, mean, label=line.name, markevery=marks, **vars(line.look))
+            axes.fill_between(x, low, high, color=line.look.color, alpha=0.18, linewidth=0)
         axes.set(xlabel=heads[0].label, ylabel=heads[1].label)
         finish(axes)
         tidy(axes)
         legend(figure, axes)
 
-    columns = [Column("line"), *heads, Column("95 % from", heads[1].digits)]
+    columns = [Column("line"), *heads, *interval_columns(heads[1].digits), Column("n")]
     rows: list[list[Cell]] = [
         [line.name, float(x), each.mean, each.low, each.high, each.n or None]
         for line in lines
         for x, each in [*zip(line.x, line.row, strict=True)][::thin]
     ]
-    columns += [Column("to", heads[1].digits), Column("n")]
-    return draw_figure(title, Table(name, title, columns, rows), 3.4, paint)
+    return draw_figure(Table(name, title, columns, rows), 3.4, paint)
 
 
 def _count(lines: Sequence[Line]) -> str:

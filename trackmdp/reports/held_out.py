@@ -12,7 +12,7 @@ import numpy as np
 
 from trackmdp.episodes.episode import Episode
 from trackmdp.reports.page import Report, Section
-from trackmdp.reports.tables import Cell, Column, Table, paragraphs
+from trackmdp.reports.tables import Cell, Column, Table, interval_columns, paragraphs
 from trackmdp.solvers.evaluation import ReplayedTracks
 from trackmdp.world.gridding import said
 from trackmdp.world.model import Array
@@ -99,7 +99,7 @@ def _about(problem: Recorded, report: Mapping[str, Any]) -> str:
 def _table(names: Mapping[str, str], report: Mapping[str, Any]) -> Table:
     columns = [Column("policy")]
     for column in _FIGURES.values():
-        columns += [column, Column("95 % from", column.digits), Column("to", column.digits)]
+        columns += [column, *interval_columns(column.digits)]
     rows: list[list[Cell]] = []
     for name, figures in report["figures"].items():
         row: list[Cell] = [names[name]]

@@ -102,7 +102,7 @@ def idea_figure(drawn: Mapped) -> Figure | None:
         "Shade: probability of the target. Frame: sensor on. Disc: target detected. Ring: missed. "
         f"{drawn.label}"
     )
-    return draw_figure(title, Table("story", title, [*heads, Column("sensed")], rows), 4.6, paint)
+    return draw_figure(Table("story", title, [*heads, Column("sensed")], rows), 4.6, paint)
 
 
 def _paint(axes: Axes, scene: Scene, columns: int, part: list[tuple[int, int]]) -> None:

@@ -71,7 +71,7 @@ def policy_map(name: str, drawn: Mapped) -> Figure:
             "; filled areas are shares of the detections in a cell, since plans differ by memory"
         )
     table = _table_of_sets(f"sets-{name}", title, drawn, sets, possible)
-    return draw_figure(title, table, 0.4 + 3.9 * len(shown), paint)
+    return draw_figure(table, 0.4 + 3.9 * len(shown), paint)
 
 
 def _table_of_sets(
@@ -155,7 +155,7 @@ def _shaded(
     side = _side(size)
     if side > 1:
         title += f"; means over tiles of {side} x {side} cells"
-    return draw_figure(title, _tiles_table(name, title, tiles, side), 2.4, paint)
+    return draw_figure(_tiles_table(name, title, tiles, side), 2.4, paint)
 
 
 def _side(size: _Size) -> int:

@@ -8,16 +8,17 @@ import re
 import textwrap
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain, cycle
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from trackmdp.reports.tables import Table
+from trackmdp.reports.ticks import Axes as Axes
 from trackmdp.reports.ticks import label_ticks
 
 if TYPE_CHECKING:  # an extra, and a second to import
-    from matplotlib import axes, figure
+    from matplotlib import figure
 
-Axes: TypeAlias = "axes.Axes"
 Canvas: TypeAlias = "figure.Figure"
 Say: TypeAlias = Callable[[str], None]
 """Receives short progress messages."""
@@ -48,23 +49,13 @@ PALETTE = {
 
 @dataclass(frozen=True)
 class Look:
-    """Colour, marker and line of one curve."""
+    """Colour, marker and line of one curve: `vars` of it are arguments of matplotlib's `plot`."""
 
-    colour: str
+    color: str
     marker: str = ""
-    line: str = "-"
-    width: float = 1.4
-    order: float = 2.0
-
-    def of_line(self) -> dict[str, Any]:
-        """Arguments of matplotlib's `plot` and `errorbar`."""
-        return {
-            "color": self.colour,
-            "marker": self.marker,
-            "linestyle": self.line,
-            "linewidth": self.width,
-            "zorder": self.order,
-        }
+    linestyle: str = "-"
+    linewidth: float = 1.4
+    zorder: float = 2.0
 
 
 # Hues far apart, and a marker for each: for print without colours, and readers with few of them.
@@ -93,11 +84,8 @@ REFERENCES = {
 
 def looks_of(labels: Sequence[str]) -> dict[str, Look]:
     """A look for each method; from the ninth on a colour comes again, dotted."""
-    count = len(LOOKS)
-    return {
-        label: LOOKS[place] if place < count else Look(**vars(LOOKS[place % count]) | {"line": ":"})
-        for place, label in enumerate(labels)
-    }
+    dotted = [replace(look, linestyle=":") for look in LOOKS]
+    return dict(zip(labels, chain(LOOKS, cycle(dotted)), strict=False))
 
 
 @dataclass(frozen=True)
@@ -105,26 +93,25 @@ class Figure:
     """A finished figure.
 
     Attributes:
-        title: caption, with n.
-        table: its numbers; `table.name` is the name of its files.
+        table: its numbers; `table.name` is the name of its files, `table.caption` its caption, with n.
         svg, png: contents of the files.
     """
 
-    title: str
     table: Table
     svg: bytes
     png: bytes
 
     def html(self) -> str:
         """The figure on the page: drawing in the colours of the page, caption, and numbers."""
-        drawing = _inline(self.svg.decode(), self.title)
+        title = html.escape(self.table.caption)
+        drawing = _inline(self.svg.decode(), title)
         return (
-            f'<figure id="{self.table.name}">{drawing}<figcaption>{html.escape(self.title)}</figcaption>'
+            f'<figure id="{self.table.name}">{drawing}<figcaption>{title}</figcaption>'
             f"<details><summary>Numbers</summary>{self.table.html()}</details></figure>"
         )
 
 
-def draw_figure(title: str, table: Table, height: float, paint: Callable[[Canvas], None]) -> Figure:
+def draw_figure(table: Table, height: float, paint: Callable[[Canvas], None]) -> Figure:
     """A figure `WIDTH` x `height` inches that `paint` draws on."""
     import matplotlib
     from matplotlib.figure import Figure as New
@@ -141,7 +128,7 @@ def draw_figure(title: str, table: Table, height: float, paint: Callable[[Canvas
         # Without date and version, which would change the bytes.
         figure.savefig(png, format="png", metadata={"Software": None})
         figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
-    return Figure(title, table, svg.getvalue(), png.getvalue())
+    return Figure(table, svg.getvalue(), png.getvalue())
 
 
 def tidy(axes: Axes) -> None:
@@ -151,22 +138,19 @@ def tidy(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def legend(figure: Canvas, axes: Axes, first: Sequence[str] = ()) -> None:
-    """A legend below the axes, in as many columns as fit; the labels in `first` come before the others."""
+def legend(figure: Canvas, axes: Axes) -> None:
+    """A legend below the axes, in as many columns as fit."""
     found = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-    order = [
-        *(name for name in first if name in found),
-        *(name for name in found if name not in first),
-    ]
-    names = [textwrap.fill(name, 40, break_on_hyphens=False) for name in order]
+    names = [textwrap.fill(name, 40, break_on_hyphens=False) for name in found]
     # Points: a letter is some .6 of its height wide, line and gaps take four heights.
     wide = (4 + 0.6 * max(map(len, names), default=0)) * TEXT
     columns = min(3, max(1, int(WIDTH * 72 / wide)))
     # Every figure has room for two lines; for more it grows.
     lines = -(-sum(name.count("\n") + 1 for name in names) // columns)
     figure.set_figheight(figure.get_figheight() + max(0, lines - 2) * 1.5 * TEXT / 72)
-    handles = [found[name] for name in order]
-    figure.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False)
+    figure.legend(
+        [*found.values()], names, loc="outside lower center", ncols=columns, frameon=False
+    )
 
 
 def _settings(name: str) -> Any:
@@ -187,7 +171,7 @@ def _settings(name: str) -> Any:
 
 
 def _inline(svg: str, title: str) -> str:
-    """The drawing as part of a page."""
+    """The drawing as part of a page; its title is HTML."""
     body = svg[svg.index("<svg") :]
     # matplotlib's style sheet would hold for the whole page.
     body = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>", "", body, flags=re.DOTALL)
@@ -203,4 +187,4 @@ def _inline(svg: str, title: str) -> str:
         f'<svg class="chart" role="img" viewBox="{view[1]}" xmlns="http://www.w3.org/2000/svg" '
         'xmlns:xlink="http://www.w3.org/1999/xlink"'
     )
-    return f'{head} aria-label="{html.escape(title)}">{rest}'
+    return f'{head} aria-label="{title}">{rest}'

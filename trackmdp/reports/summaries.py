@@ -9,7 +9,7 @@ from trackmdp.config.compose import compose
 from trackmdp.errors import UserError
 from trackmdp.reports.grouping import OPEN, Study
 from trackmdp.reports.results import Anomaly
-from trackmdp.reports.tables import Cell, Column, Table
+from trackmdp.reports.tables import Cell, Column, Table, interval_columns
 from trackmdp.statistics import iqm, mean_over_groups
 
 FIGURES = {
@@ -36,21 +36,12 @@ OPEN_ENDS = [Column("best AIHTR known", 3), Column("upper bound", 3)]
 """Of worlds whose optimum is not certified, as those of several targets."""
 
 
-def interval_columns(head: str, digits: int) -> list[Column]:
-    """Columns for the ends of an interval."""
-    return [Column(f"{head}95 % from", digits), Column("to", digits)]
-
-
 def outcome_table(study: Study, threshold: float | None) -> Table:
     """Each method and each policy it is compared with, over all worlds, every world with the same weight.
 
     With a `threshold`, also the number of runs with a regret of at most that.
     """
-    spread = [
-        *interval_columns("", 5),
-        Column("interquartile mean", 5),
-        Column("worst", 5),
-    ]
+    spread = [*interval_columns(5), Column("interquartile mean", 5), Column("worst", 5)]
     spread += [*_within_column(threshold), Column("n")]
     rows: list[list[Cell]] = []
     for method in study.methods:
@@ -108,7 +99,7 @@ def groups_table(study: Study, threshold: float | None) -> Table:
         within = _within(study.values(world, method, "regret"), threshold)
         rows.append([world, method, *cells, *study.ends(world), *ends, *within, len(runs)])
     columns = [Column("world"), Column("method"), *FIGURES.values(), *OPEN_ENDS]
-    columns += [*interval_columns("AIHTR: ", 3), *interval_columns("regret: ", 5)]
+    columns += [*interval_columns(3, "AIHTR: "), *interval_columns(5, "regret: ")]
     caption = (
         "Every world and method: means over n seeds, with intervals of the AIHTR and of the regret"
     )

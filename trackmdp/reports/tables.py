@@ -67,6 +67,11 @@ class Column:
         return zero if shown.lstrip("-") == zero else shown.replace("-", "−")
 
 
+def interval_columns(digits: int | None, head: str = "") -> list[Column]:
+    """Columns for the ends of an interval."""
+    return [Column(f"{head}95 % from", digits), Column("to", digits)]
+
+
 @dataclass(frozen=True)
 class Table:
     """Rows under columns.

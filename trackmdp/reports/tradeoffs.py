@@ -52,10 +52,9 @@ def tradeoff_figure(found: Tradeoff, asked: Mapping[str, Mixture]) -> Figure:
 
     columns = [Column("price"), Column("sensors per step", 4), Column("accuracy", 4)]
     rows = [[each.price, each.sensors, each.accuracy, each.net] for each in found.corners]
-    table = Table(
-        "frontier", "Corners of the frontier", [*columns, Column("net accuracy", 4)], rows
-    )
-    return draw_figure("Accuracy against sensors per step", table, 0.9 + 1.7 * len(parts), paint)
+    title = "Accuracy against sensors per step"
+    table = Table("frontier", title, [*columns, Column("net accuracy", 4)], rows)
+    return draw_figure(table, 0.9 + 1.7 * len(parts), paint)
 
 
 def _draw(axes: Axes, found: Tradeoff, asked: Mapping[str, Mixture], name: str) -> None:
@@ -101,11 +100,11 @@ def swept_figure(study: Study, panel: Panel) -> Figure | None:
 
     def paint(figure: Canvas) -> None:
         axes = figure.subplots()
-        _points(axes, hull, REFERENCES["best known"].of_line() | {"label": name})
+        _points(axes, hull, vars(REFERENCES["best known"]) | {"label": name})
         # Also those below the line, which a mixture of their neighbours beats.
         _points(axes, best, {"color": INK, "marker": "+", "linestyle": ""})
         for method, look in looks_of(study.methods).items():
-            _points(axes, learned[method], look.of_line() | {"linestyle": "", "label": method})
+            _points(axes, learned[method], vars(look) | {"linestyle": "", "label": method})
         axes.set(xlabel="sensors per step", ylabel="accuracy")
         tidy(axes)
         legend(figure, axes)
@@ -127,7 +126,7 @@ def swept_figure(study: Study, panel: Panel) -> Figure | None:
     columns = [Column("policy"), Column("c", 2), Column("sensors per step", 3)]
     columns += [Column("accuracy", 4), Column("on the line"), Column("n")]
     table = Table(f"frontier-{panel.name}", title, columns, rows)
-    return draw_figure(title, table, 3.4, paint) if count else None
+    return draw_figure(table, 3.4, paint) if count else None
 
 
 def _learned(study: Study, panel: Panel, method: str) -> list[_Place]:
