@@ -149,7 +149,7 @@ FAULTS: dict[str, tuple[Fault, str]] = {
         SEARCH,
     ),
     "D is not charged with modes": (
-        elsewhere(proofs, "evaluate", modes=True, safe_cost=0.0),
+        elsewhere(proofs, "value_of", modes=True, safe_cost=0.0),
         "value, modes: the exact value of",
     ),
     "a bound has dearer sensors": (elsewhere(bounds, "clocked", cost=dear), CLOCKED),
@@ -160,11 +160,11 @@ FAULTS: dict[str, tuple[Fault, str]] = {
     ),
     # Of values.
     "sensors are charged .1 % too much": (
-        elsewhere(proofs, "evaluate", cost=lambda world: 1.001 * world.cost),
+        elsewhere(proofs, "value_of", cost=lambda world: 1.001 * world.cost),
         VALUE,
     ),
-    "sensors never miss": (elsewhere(proofs, "evaluate", detection=1.0), VALUE),
-    "the safe action never misses": (elsewhere(proofs, "evaluate", safe_detection=1.0), VALUE),
+    "sensors never miss": (elsewhere(proofs, "value_of", detection=1.0), VALUE),
+    "the safe action never misses": (elsewhere(proofs, "value_of", safe_detection=1.0), VALUE),
     # Of bounds.
     "the clock of the bound is a step short": (
         elsewhere(bounds, "clocked", t_max=lambda world: world.t_max - 1),
@@ -245,7 +245,7 @@ FAULTS: dict[str, tuple[Fault, str]] = {
         "Q_MDP: threshold c p_in /",
     ),
     "Q_MDP is valued too high": (
-        spoilt(theorems, "evaluate", lambda found, *_: replace(found, value=found.value + 100.0)),
+        spoilt(theorems, "value_of", lambda found, *_: replace(found, value=found.value + 100.0)),
         "order: Q_MDP <= optimum",
     ),
 }
