@@ -53,7 +53,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"algo": "hindsight", "algo.learning_rat": 1},
         "algo.learning_rat: unknown option, did you mean algo.learning_rate",
     ),
-    ({"sead": 1}, "sead: unknown option, did you mean seed? (known: quiet, grid"),
+    ({"sead": 1}, "sead: unknown option, did you mean seed? (known: quiet, "),
     ({"seed": "abc"}, "seed=abc: expected an integer >= 0"),
     ({"grid.size": 2}, "grid.size=2: expected an integer >= 3"),
     ({"algo": "ppo", "algo.minibatches": 3}, "algo.minibatches=3: expected a divisor"),

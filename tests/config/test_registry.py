@@ -38,5 +38,5 @@ def test_a_price_for_each_cell_is_no_node_of_its_own(monkeypatch: pytest.MonkeyP
     prices = [0.5] * 90_000
     with monkeypatch.context() as patch:
         patch.setattr(ListConfig, "append", lambda *_: pytest.fail("a node for a price"))
-        found = resolved({"cost": {"sensor": prices}, "same": "${cost.sensor}"}, {})
+        found = resolved({"cost": {"sensor": prices}, "same": "${cost.sensor}"})
     assert found == {"cost": {"sensor": prices}, "same": prices}

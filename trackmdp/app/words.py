@@ -119,11 +119,11 @@ def _refuse_wrong(error: Exception, command: str, words: Sequence[str], compose:
     for choices in itertools.product(*map(_single_words, [*files, *groups])):
         try:
             values = composed_values(compose(choices), ROOTS[command])
+            known = known_options(values, ROOTS[command])
         except (
             Exception
         ):  # the choices themselves are at fault; at the end Hydra's own message is reported
             continue
-        known = dict(known_options(ROOTS[command], values))
         for override in overrides:
             if override not in [*files, *groups]:
                 _check_value(override, known)

@@ -17,13 +17,13 @@ class BaselineConfig(ChoiceConfig):
     The code of a choice gets the world and the options of the choice, and returns a `Policy` or a `Solution`.
 
     Attributes:
-        reads_motion: needs the kernel; recorded tracks have none.
+        without_motion: needs no kernel; recorded tracks have none.
         knows_footprints: sensors may cover several cells.
         knows_budget: keeps to a limit on the sensors on in a step.
         whole_episodes: plans for episodes that only the exit ends; `grid.max_steps` then counts in the valuing alone.
     """
 
-    reads_motion: ClassVar[bool] = True
+    without_motion: ClassVar[bool] = False
     whole_episodes: ClassVar[bool] = False
     knows_footprints: ClassVar[bool] = True
     knows_budget: ClassVar[bool] = True
@@ -41,21 +41,21 @@ class QmdpConfig(BaselineConfig):
 class AllOnConfig(BaselineConfig):
     """All sensors on, always."""
 
-    reads_motion: ClassVar[bool] = False
+    without_motion: ClassVar[bool] = True
 
 
 @choice("baseline", "none", makes="trackmdp.policies.policy:Policy.none")
 class NoSensorsConfig(BaselineConfig):
     """No sensor on until the safe action is forced."""
 
-    reads_motion: ClassVar[bool] = False
+    without_motion: ClassVar[bool] = True
 
 
 @choice("baseline", "random_k", makes="trackmdp.policies.policy:Policy.random_k")
 class RandomKConfig(BaselineConfig):
     """k sensors drawn at random each step."""
 
-    reads_motion: ClassVar[bool] = False
+    without_motion: ClassVar[bool] = True
     k: int = option("sensors switched on, at most as many as there are", unit="sensors", ge=0)
 
     def check(self, key: str, root: Any) -> None:
@@ -128,7 +128,7 @@ class OptimalConfig(BaselineConfig):
 class SetsConfig(BaselineConfig):
     """The sets in a file of evaluate, solve, export or a run."""
 
-    reads_motion: ClassVar[bool] = False
+    without_motion: ClassVar[bool] = True
     file: str = option("the sets", expects="a sets.json, or a sets.npz or policy.npz", path=True)
 
 

@@ -31,11 +31,15 @@ class PartitionConfig(NodeConfig):
     )
 
     def check(self, key: str, root: Any) -> None:
-        """Learning by blocks needs a motion that can be cut to a rectangle, and keeps no log but the blocks' own."""
-        if self.block is None or not root.learns:
+        """A motion can be cut to a rectangle; by blocks, no log is written but the blocks' own."""
+        if self.block is None:
             return
         if not root.kernel.is_motion or root.kernel.hides:
             raise refuse(f"{key}.block", self.block, f"null with kernel={root.kernel.name}")
+        if root.sensor.covers:
+            raise refuse(f"{key}.block", self.block, f"null with sensor={root.sensor.name}")
+        if not root.learns:
+            return
         if [*root.log] not in ([], ["csv"]):
             raise refuse(
                 "log", listed(root.log), f"[csv] with {key}.block: each block has a log of its own"

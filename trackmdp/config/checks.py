@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+from omegaconf import MISSING
+
 from trackmdp.config.options import GROUPS, Option, is_number, leaves, nodes, options, refuse
 from trackmdp.errors import UserError
 
@@ -89,7 +91,7 @@ def check_choice(group: str, name: Any) -> None:
 
 
 def validate(cfg: Any, place: str = "", root: Any = None) -> None:
-    """Refuse the first option that is out of range or breaks a rule.
+    """Refuse the first option that is missing, is out of range or breaks a rule.
 
     Args:
         cfg: the config of a command, or a part of one.
@@ -100,6 +102,8 @@ def validate(cfg: Any, place: str = "", root: Any = None) -> None:
         UserError: the message has the key, the value and the range.
     """
     for key, item, value in leaves(cfg, place):
+        if value == MISSING:
+            raise UserError(f"{key}: missing, expected {item.expected}")
         if not item.allows(value):
             raise refuse(key, value, item.expected)
     # Rules between options may count on every single value; the rule of a node comes after those around it.

@@ -21,7 +21,7 @@ from trackmdp.config.checks import (
     refuse_ignored,
     validate,
 )
-from trackmdp.config.options import GROUPS, Node, Option, options
+from trackmdp.config.options import GROUPS, Node, Option, leaves, options
 from trackmdp.config.registry import choice_values, read_values, resolved
 from trackmdp.config.roots import ROOTS, CommandConfig
 from trackmdp.config.tree import build_config
@@ -45,7 +45,7 @@ def compose(
     """
     typed, schema = dict(_by_option(overrides or {})), ROOTS[command]
     values = _values(command, schema, typed)
-    known = dict(known_options(schema, values))
+    known = known_options(values, schema)
     # After all choices, so that `algo.epochs` is looked up among the options of the chosen algorithm.
     for key, value in typed.items():
         if not isinstance(options(schema).get(key), Node):
@@ -55,7 +55,7 @@ def compose(
             for parent in parents:
                 node = node[parent]
             node[last] = value
-    cfg = _checked(values, known, schema, folder or Path.cwd())
+    cfg = _checked(values, schema, folder or Path.cwd())
     refuse_ignored(cfg, typed)
     return cfg
 
@@ -93,62 +93,50 @@ def from_hydra(cfg: DictConfig, root: type[_C], folder: Path) -> _C:
     Raises:
         UserError: an unknown key (also one added with `+`), a missing value, a wrong type, or a broken rule.
     """
-    values = composed_values(cfg, root)
-    checked: _C = _checked(values, dict(known_options(root, values)), root, folder)
+    checked: _C = _checked(composed_values(cfg, root), root, folder)
     return checked
 
 
 def composed_values(cfg: DictConfig, schema: type[Any]) -> dict[str, Any]:
-    """The values of a composition by Hydra, unresolved, with the name of each choice, which is the type of its node."""
+    """The values of a composition by Hydra, unresolved, with the name of each choice, which is the type of its node.
+
+    Raises:
+        UserError: a file chosen from a group has no schema of the group at its head.
+    """
     values: Any = OmegaConf.to_container(cfg, resolve=False)
     values.pop("hydra", None)
     for key, item in options(schema).items():
         if isinstance(item, Option) or not isinstance(values.get(key), dict):
             continue
         node: Any = cfg._get_node(key)
-        if not item.several:
+        if item.several:
+            for name in values[key]:
+                # An entry without a file of the group, such as the one of `+log.mcap.every=2`.
+                if OmegaConf.get_type(node, name) is not GROUPS[key].get(name):
+                    raise UserError(
+                        f"{key}.{name}: not chosen, expected {key}=[NAME,...] with it among the names"
+                    )
+        elif key in GROUPS:
             # A file of the user's may have any name: the schema at its head decides.
-            name = getattr(OmegaConf.get_type(node), "name", None)
-            values[key] |= {"name": name} if name else {}
-            continue
-        for name in values[key]:
-            # An entry without a file of the group, such as the one of `+log.mcap.every=2`.
-            if OmegaConf.get_type(node, name) is not GROUPS[key].get(name):
-                raise UserError(
-                    f"{key}.{name}: not chosen, expected {key}=[NAME,...] with it among the names"
-                )
+            chosen: Any = OmegaConf.get_type(node)
+            if chosen not in GROUPS[key].values():
+                names = "|".join(GROUPS[key])
+                raise UserError(f"{key}: expected a file that begins with defaults: [{names}]")
+            values[key]["name"] = chosen.name
     return dict(values)
 
 
-def _checked(
-    values: dict[str, Any], known: Mapping[str, Option], schema: type[Any], folder: Path
-) -> Any:
+def _checked(values: dict[str, Any], schema: type[Any], folder: Path) -> Any:
     """The dataclasses of the values, resolved and checked."""
-    cfg = build_config(resolved(values, known), schema)
+    cfg = build_config(resolved(values), schema)
     validate(cfg)
     absolute_paths(cfg, folder)
     return cfg
 
 
-def known_options(schema: type[Any], values: Any, prefix: str = "") -> Iterator[tuple[str, Option]]:
+def known_options(values: dict[str, Any], schema: type[Any]) -> dict[str, Option]:
     """Dotted key -> option of everything in the config with these choices."""
-    for name, item in options(schema).items():
-        key, inner = f"{prefix}{name}", values.get(name)
-        if isinstance(item, Option):
-            yield key, item
-        elif not isinstance(
-            inner, dict
-        ):  # null, or "???" after `~kernel`, which is refused as missing
-            continue
-        elif item.several:
-            for each, own in inner.items():
-                yield from known_options(GROUPS[name][each], own, f"{key}.{each}.")
-        elif name in GROUPS and inner.get("name") not in GROUPS[name]:
-            names = "|".join(GROUPS[name])
-            raise UserError(f"{name}: expected a file that begins with defaults: [{names}]")
-        else:
-            chosen = GROUPS[name][inner["name"]] if name in GROUPS else item.schema
-            yield from known_options(chosen, inner, f"{key}.")
+    return {key: item for key, item, _ in leaves(build_config(values, schema))}
 
 
 def _by_option(given: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -6,7 +6,16 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from trackmdp.config.checks import unknown_option, validate
-from trackmdp.config.options import GROUPS, Option, choice, option, options, refuse
+from trackmdp.config.options import (
+    GROUPS,
+    TABLES,
+    Option,
+    choice,
+    option,
+    options,
+    refuse,
+    require_able,
+)
 from trackmdp.config.registry import choice_values, resolved
 from trackmdp.config.world import KernelConfig
 
@@ -29,19 +38,9 @@ class HiddenKernelConfig(KernelConfig):
     )
 
     def check(self, key: str, root: Any) -> None:
-        """Learners with a memory, solving over keys, and exact evaluation take modes; nothing else does."""
-        able = [
-            name
-            for name, schema in GROUPS["algo"].items()
-            if (schema.told if self.reveals else schema.remembers)
-        ]
-        if root.learns and root.algo.name not in able:
-            known = f"kernel={self.name}" + f" and {key}.reveals=true" * self.reveals
-            raise refuse("algo", root.algo.name, f"one of {', '.join(able)} with {known}")
-        solver, partition = getattr(root, "solver", None), getattr(root, "partition", None)
-        blocks = partition is not None and partition.block is not None
-        if solver is not None and blocks:
-            raise refuse(key, self.name, "with it no blocks")
+        """Of the learners those with a memory take modes."""
+        known = f"with kernel={self.name}" + f" and {key}.reveals=true" * self.reveals
+        require_able(root, "told" if self.reveals else "remembers", known)
 
 
 @choice("kernel", "heading", makes="trackmdp.world.modes:heading_kernel")
@@ -168,7 +167,7 @@ def _regime(key: str, entry: Any, root: Any) -> dict[str, Any]:
     Raises:
         UserError: there is no such kernel of cells, or an option is not allowed.
     """
-    if isinstance(entry, str) and Path(entry).suffix in (".npy", ".npz", ".csv"):
+    if isinstance(entry, str) and Path(entry).suffix in TABLES:
         entry = {"kernel": "table", "path": entry}
     known = [
         name for name, schema in GROUPS["kernel"].items() if schema.is_motion and not schema.hides
@@ -186,7 +185,7 @@ def _regime(key: str, entry: Any, root: Any) -> dict[str, Any]:
             f"{key}.{each}": item for each, item in schema.items() if isinstance(item, Option)
         }
         raise unknown_option(f"{key}.{unknown[0]}", beside)
-    plain = resolved(values | given, schema, f"{key}.")
+    plain = resolved(values | given)
     node = GROUPS["kernel"][name](**{option: plain[option] for option in schema})
     validate(node, key, root)
     return {"kernel": name} | vars(node)

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 from trackmdp.cluster import ADDRESS
 from trackmdp.config.options import (
     BYTES,
+    TABLES,
     ChoiceConfig,
     NodeConfig,
     Sizes,
@@ -290,7 +291,7 @@ def file_of_classes(algo: AlgoConfig) -> str | None:
 def check_classes(key: str, algo: AlgoConfig) -> None:
     """Refuse a text that is neither a word of `share_cells` nor the name of a table."""
     given = file_of_classes(algo)
-    if given is not None and Path(given).suffix not in (".npy", ".npz", ".csv"):
+    if given is not None and Path(given).suffix not in TABLES:
         expected = "all, none, or a path to a .npy, .npz or .csv file"
         raise refuse(key, given, expected)
 

@@ -153,6 +153,9 @@ def nested(help: str) -> Any:
     return dataclasses.field(metadata={"nested": help})
 
 
+TABLES = (".npy", ".npz", ".csv")
+"""Endings of the files with a table of numbers."""
+
 BYTES = {"float32": 4, "int64": 8, "float64": 8, "int16": 2, "bool": 1}
 """Bytes of one number of each kind, for `needs`."""
 
@@ -327,6 +330,24 @@ def refuse(key: str, value: object, expected: str) -> UserError:
     return UserError(
         f"{key}={textwrap.shorten(text, 200, placeholder=' ...')}: expected {expected}"
     )
+
+
+def require_able(root: Any, ability: str, why: str) -> None:
+    """Refuse a solver, a baseline or an algorithm that lacks an ability.
+
+    Args:
+        root: the config of the command.
+        ability: a class attribute of the schemas of some of these groups, such as ``knows_budget``.
+        why: ends the message, such as ``with cost.budget=2``.
+
+    Raises:
+        UserError: one lacks it; the message has the choices that do not.
+    """
+    for group in ("solver", "baseline", "algo"):
+        chosen = getattr(root, group, None)
+        if chosen is not None and not getattr(chosen, ability, True):
+            able = [name for name, schema in GROUPS[group].items() if getattr(schema, ability)]
+            raise refuse(group, chosen.name, f"one of {', '.join(able)} {why}")
 
 
 def is_number(text: str) -> bool:

@@ -20,7 +20,7 @@ import importlib
 import importlib.metadata
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from operator import attrgetter
 from pathlib import Path
@@ -131,28 +131,18 @@ def choice_values(group: str, name: str) -> dict[str, Any]:
     return values
 
 
-def resolved(values: dict[str, Any], known: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """The values with every ``${...}`` replaced.
-
-    Args:
-        values: nested, by key.
-        known: the option of each dotted key.
-        prefix: stands before a key in messages.
+def resolved(values: dict[str, Any]) -> dict[str, Any]:
+    """The values, nested by key, with every ``${...}`` replaced; ``???`` stays.
 
     Raises:
-        UserError: a value is missing, or an interpolation leads nowhere.
+        UserError: an interpolation leads nowhere, or a value is of no kind that a file has.
     """
     register_resolvers()
     try:
-        config = OmegaConf.create(_wrapped(values))
-        # Before resolving, which leaves `???` in place; sorted, since a set has an order of its own each time.
-        for key in sorted(OmegaConf.missing_keys(config)):
-            expected = known[key].expected if key in known else f"{key}=NAME"
-            raise UserError(f"{prefix}{key}: missing, expected {expected}")
-        plain: Any = OmegaConf.to_container(config, resolve=True)
+        plain: Any = OmegaConf.to_container(OmegaConf.create(_wrapped(values)), resolve=True)
     except OmegaConfBaseException as error:
         # Its further lines (full_key, object_type) are about OmegaConf.
-        where = f"{prefix}{error.full_key}: " if isinstance(error, UnsupportedValueType) else ""
+        where = f"{error.full_key}: " if isinstance(error, UnsupportedValueType) else ""
         raise UserError(f"{where}{str(error).splitlines()[0]}") from error
     return dict(plain)
 

@@ -5,7 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, ClassVar
 
-from trackmdp.config.options import GROUPS, ChoiceConfig, Option, choice, listed, option, refuse
+from trackmdp.config.options import (
+    TABLES,
+    ChoiceConfig,
+    Option,
+    choice,
+    listed,
+    option,
+    refuse,
+    require_able,
+)
 from trackmdp.config.world import GridConfig
 from trackmdp.errors import UserError
 
@@ -79,12 +88,7 @@ def _check_budget(key: str, budget: int, root: Any) -> None:
     """
     if root.sensor.covers:
         raise refuse(key, budget, f"null with sensor={root.sensor.name}")
-    for group in ("solver", "baseline", "algo"):
-        planner = getattr(root, group, None)
-        if planner is not None and not planner.knows_budget:
-            known = [name for name, schema in GROUPS[group].items() if schema.knows_budget]
-            expected = f"one of {', '.join(known)}" if known else f"{key}=null"
-            raise refuse(group, planner.name, f"{expected} with {key}={budget}")
+    require_able(root, "knows_budget", f"with {key}={budget}")
     # Blocks settle what they share by trees, which decide on one cell at a time.
     partition = getattr(root, "partition", None)
     if root.any_number or (partition is not None and partition.block is not None):
@@ -123,23 +127,13 @@ class SensorConfig(ChoiceConfig):
 
     def _check_solver(self, key: str, root: Any) -> None:
         """Refuse solvers, learners and proofs for sensors of one cell, where each covers several."""
-        for group in ("solver", "baseline", "algo"):
-            planner = getattr(root, group, None)
-            if planner is not None and not planner.knows_footprints:
-                known = [name for name, schema in GROUPS[group].items() if schema.knows_footprints]
-                raise refuse(
-                    group, planner.name, f"one of {', '.join(known)} with {key}={self.name}"
-                )
+        require_able(root, "knows_footprints", f"with {key}={self.name}")
         if getattr(root, "verify", False):
             raise refuse(
                 "verify",
                 True,
                 f"false with {key}={self.name}: the theorems are on sensors of one cell",
             )
-        if (
-            partition := getattr(root, "partition", None)
-        ) is not None and partition.block is not None:
-            raise refuse("partition.block", partition.block, f"null with {key}={self.name}")
 
 
 @choice("sensor", "perfect", makes="trackmdp.world.make:perfect")
@@ -225,7 +219,7 @@ class FootprintConfig(MissConfig):
 
     def check(self, key: str, root: Any) -> None:
         """A file of a known kind; options that exclude footprints are refused."""
-        if self.path is not None and Path(self.path).suffix not in (".npz", ".npy", ".csv"):
+        if self.path is not None and Path(self.path).suffix not in TABLES:
             raise refuse(f"{key}.path", self.path, "a path to a .npz, .npy or .csv file")
         super().check(key, root)
         self._check_solver(key, root)
@@ -274,11 +268,7 @@ def _check_per_cell(
             if not (some if each is None else number.allows(each)):
                 raise refuse(f"{key}[{index}]", each, f"a {allowed}" + ", or null" * some)
         return
-    fine = (
-        Path(value).suffix in (".npy", ".npz", ".csv")
-        if isinstance(value, str)
-        else number.allows(value)
-    )
+    fine = Path(value).suffix in TABLES if isinstance(value, str) else number.allows(value)
     if value is None or not fine:
         several = "" if count is None else f" of {count} of them"
         expected = f"a {allowed}, a list{several} (one per {each_of}), or a path to a .npy, .npz or .csv file"

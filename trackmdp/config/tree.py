@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from omegaconf import OmegaConf
+from omegaconf import MISSING, OmegaConf
 
 from trackmdp.config.checks import absolute_paths, check_choice, own_paths, suggestion, validate
 from trackmdp.config.options import GROUPS, Node, Option, as_float, options
@@ -138,6 +138,8 @@ def _built(key: str, item: Option | Node, value: Any, prefix: str) -> Any:
         return as_float(value) if item.kind is float and type(value) is int else value
     if value is None and item.optional:
         return None
+    if value == MISSING:
+        raise UserError(f"{prefix}{key}: missing, expected {key}=NAME")
     if item.several and isinstance(value, Mapping):
         for name in value:
             check_choice(key, name)

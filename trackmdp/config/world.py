@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from trackmdp.config.options import (
-    GROUPS,
     ChoiceConfig,
     NodeConfig,
     Sizes,
     choice,
     option,
     refuse,
+    require_able,
 )
 from trackmdp.errors import UserError
 
@@ -109,12 +109,8 @@ class TaskConfig(NodeConfig):
 
     def check(self, key: str, root: Any) -> None:
         """A memory of more than the cell takes a learner of it."""
-        if self.memory == "cell":
-            return
-        readers = [name for name, schema in GROUPS["algo"].items() if schema.remembers]
-        if root.learns and not root.algo.remembers:
-            expected = f"cell with algo={root.algo.name}; more is learned by {', '.join(readers)}"
-            raise refuse(f"{key}.memory", self.memory, expected)
+        if self.memory != "cell":
+            require_able(root, "remembers", f"with {key}.memory={self.memory}")
 
     def needs(self, task: Sizes, root: Any) -> dict[str, int]:
         """A set for every key and n, and its search."""
@@ -144,8 +140,15 @@ class KernelConfig(ChoiceConfig):
         return f"kernel={self.name}"
 
 
+class ExitingConfig(KernelConfig):
+    """Common options of the kernels of moves around each cell."""
+
+    exit_probability: float = option("probability of leaving the grid", unit="per step", ge=0, lt=1)
+    border: str = option("rule for positions outside the grid", choices=BORDERS)
+
+
 @choice("kernel", "random_support", makes="trackmdp.world.kernels:random_support")
-class RandomSupportConfig(KernelConfig):
+class RandomSupportConfig(ExitingConfig):
     """The paper's motion: Z random positions around each cell, one of low probability, the others equal."""
 
     support_size: int = option(
@@ -155,8 +158,6 @@ class RandomSupportConfig(KernelConfig):
     low_probability: float = option(
         "probability of the one unlikely position", unit="per step", gt=0, lt=1
     )
-    exit_probability: float = option("probability of leaving the grid", unit="per step", ge=0, lt=1)
-    border: str = option("rule for positions outside the grid", choices=BORDERS)
     seed: int = option("seed of the random positions", ge=0)
 
     def check(self, key: str, root: Any) -> None:
@@ -173,25 +174,21 @@ class RandomSupportConfig(KernelConfig):
 
 
 @choice("kernel", "random_walk", makes="trackmdp.world.kernels:random_walk")
-class RandomWalkConfig(KernelConfig):
+class RandomWalkConfig(ExitingConfig):
     """A lazy random walk on the 4 or 8 neighbours."""
 
     stay: float = option("probability of staying in the cell", unit="per step", ge=0, le=1)
     diagonal: bool = option("whether the 4 diagonal neighbours are reached as well")
-    exit_probability: float = option("probability of leaving the grid", unit="per step", ge=0, lt=1)
-    border: str = option("rule for positions outside the grid", choices=BORDERS)
 
 
 @choice("kernel", "drift", makes="trackmdp.world.kernels:drift")
-class DriftConfig(KernelConfig):
+class DriftConfig(ExitingConfig):
     """A target that heads one way most of the time."""
 
     direction: float = option("heading, 0 = right, 90 = up", unit="degrees", ge=0, lt=360)
     persistence: float = option(
         "probability of keeping to the heading", unit="per step", ge=0, le=1
     )
-    exit_probability: float = option("probability of leaving the grid", unit="per step", ge=0, lt=1)
-    border: str = option("rule for positions outside the grid", choices=BORDERS)
 
 
 @choice("kernel", "table", makes="trackmdp.world.kernels:load_table")
@@ -267,10 +264,4 @@ class TracksConfig(KernelConfig):
         """Recorded tracks have no motion model: solvers and baselines that read one are refused."""
         if root.needs_motion:
             raise refuse(key, self.name, "a motion model, which train and evaluate do without")
-        baseline = getattr(root, "baseline", None)
-        if baseline is not None and baseline.reads_motion:
-            known = [name for name, schema in GROUPS["baseline"].items() if not schema.reads_motion]
-            expected = (
-                f"{', '.join(known[:-1])} or {known[-1]} with kernel=tracks, without a motion model"
-            )
-            raise refuse("baseline", baseline.name, expected)
+        require_able(root, "without_motion", "with kernel=tracks, without a motion model")

@@ -194,7 +194,7 @@ def baseline_policy(problem: Problem, choice: BaselineConfig) -> Policy:
     """
     from trackmdp.policies.policy import as_policy
 
-    if choice.reads_motion:
+    if not choice.without_motion:
         world = modelled(problem, f"baseline={choice.name}")
         if choice.whole_episodes and world.max_steps is not None:
             world = world.but(max_steps=None)

@@ -201,7 +201,7 @@ NEEDS_THE_MODEL = sorted(set(GROUPS["baseline"]) - {"all_on", "none", "random_k"
             (
                 "evaluate",
                 f"baseline={name}",
-                f"baseline={name}: expected all_on, none, random_k or sets with kernel=tracks",
+                f"baseline={name}: expected one of all_on, none, random_k, sets with kernel=tracks",
             )
             for name in NEEDS_THE_MODEL
             if name != "playback"
