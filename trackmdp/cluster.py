@@ -8,10 +8,12 @@ import socket
 from collections.abc import Iterator
 from contextlib import chdir, contextmanager
 from pathlib import Path
+from typing import Any
 
 from trackmdp.errors import UserError
 from trackmdp.imports import safe_children
 from trackmdp.signals import handled
+from trackmdp.untrusted import reason
 
 ADDRESS = r"auto|(\[[\da-fA-F:.]+\]|[\w.-]+):\d{1,5}"
 """Pattern of the address of a cluster: host:port, or `auto` for the one in RAY_ADDRESS."""
@@ -37,8 +39,24 @@ def joining(key: str, address: str | None) -> Iterator[None]:
         ):
             yield
     except (ConnectionError, ValueError, RuntimeError) as error:
-        given, reason = "null" if address is None else address, " ".join(str(error).split())
-        raise UserError(f"{key}={given}: expected a Ray cluster ({reason})") from error
+        given, why = "null" if address is None else address, reason(error)
+        raise UserError(f"{key}={given}: expected a Ray cluster ({why})") from error
+
+
+def ray_options(address: str | None, cores: int | None, store: int | None = None) -> dict[str, Any]:
+    """Arguments of `ray.init`.
+
+    Args:
+        address: of the cluster to join; None or ``local`` to start one on this machine.
+        cores: of a cluster started here; None for all.
+        store: bytes for its objects; None for Ray's own choice.
+    """
+    quiet = {"logging_level": "error"}
+    if address not in (None, "local"):
+        return {"address": address} | quiet  # its resources were fixed when it was started
+    # Without an address Ray would join a cluster that runs here, or the one that RAY_ADDRESS names.
+    started = {"address": "local", "num_cpus": cores, "object_store_memory": store}
+    return started | {"include_dashboard": False} | quiet
 
 
 def _reach(address: str | None) -> None:

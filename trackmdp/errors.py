@@ -41,6 +41,11 @@ class Preempted(BaseException):
         return f"stopped by signal {self.signal}"
 
 
+def first_line(error: BaseException) -> str:
+    """The first line of an error's message, or the name of its class."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0].strip()
+
+
 def adding(extra: str) -> str:
     """The line that installs an extra: in the clone that this package is imported from, or by the package's name."""
     clone = Path(__file__).parents[1]

@@ -41,11 +41,11 @@ def generator(seed: int, *names: str | int, device: torch.device | str = "cpu") 
     return torch.Generator(device=device).manual_seed(derive(seed, *names))
 
 
-def seed_global(seed: int) -> None:
+def seed_global(seed: int, *names: str) -> None:
     """Seed torch's global generator: network initialisation and the sampling inside TorchRL's actors use it."""
     import torch
 
-    torch.manual_seed(derive(seed, "torch"))
+    torch.manual_seed(derive(seed, "torch", *names))
 
 
 @contextmanager

@@ -195,17 +195,6 @@ def test_sparse_weights_are_refused_in_one_line(half: Path, capfd: Any) -> None:
     assert len(capfd.readouterr().err.splitlines()) == 1
 
 
-@pytest.mark.parametrize("callbacks", [{}, [1]])
-def test_a_state_without_those_of_the_callbacks_is_refused(half: Path, callbacks: Any) -> None:
-    """`metrics.csv` would begin anew."""
-    cfg = train_config(
-        *SMALL["ppo"], *QUICK, *BUDGET, "checkpoint.keep=3", f"resume={checkpoint.newest(half)}"
-    )
-    forged(half, callbacks=callbacks)
-    with pytest.raises(UserError, match="no states of callbacks"):
-        find(cfg, read_problem(half / PROBLEM), half, CPU)
-
-
 @pytest.mark.parametrize(
     "package", ["torch", "torchrl", "tensordict", "numpy", "scipy", "trackmdp"]
 )

@@ -36,7 +36,7 @@ from trackmdp.config import GROUPS, ROOTS
 from trackmdp.config.checks import validate
 from trackmdp.config.options import options
 from trackmdp.config.registry import maker
-from trackmdp.errors import UserError
+from trackmdp.errors import UserError, first_line
 
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
@@ -251,8 +251,7 @@ def answer(compose: Composer, args: argparse.Namespace) -> bool:
         else:
             hydra.shell_completion(compose.name, compose.words)
     except Exception as error:  # of many kinds; all are about the command line
-        lines = str(error).strip().splitlines() or [type(error).__name__]
-        raise UserError(lines[0]) from error
+        raise UserError(first_line(error)) from error
     return True
 
 

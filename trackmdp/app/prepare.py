@@ -20,7 +20,7 @@ from trackmdp.config.compose import from_hydra
 from trackmdp.config.learning import file_of_classes
 from trackmdp.config.logs import require_packages
 from trackmdp.config.resume import continued, key_of, run_folder
-from trackmdp.errors import UserError
+from trackmdp.errors import UserError, first_line
 from trackmdp.imports import importing
 
 if TYPE_CHECKING:
@@ -247,8 +247,7 @@ def folder_of(cfg: DictConfig, key: str) -> Path:
     try:
         value = OmegaConf.select(cfg, key)  # None for a missing key, and for "???"
     except Exception as error:  # a resolver of `${name:...}` may raise anything
-        lines = str(error).strip().splitlines() or [type(error).__name__]
-        raise UserError(f"{key}: {lines[0]}") from error
+        raise UserError(f"{key}: {first_line(error)}") from error
     if not isinstance(value, str):
         raise UserError(f"{key}: missing, expected a folder")
     folder = Path(value)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import multiprocessing
 import os
 import signal
@@ -15,7 +14,7 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import Any, Protocol, TypeVar
 
-from trackmdp.cluster import joining
+from trackmdp.cluster import joining, ray_options
 from trackmdp.errors import Preempted, UserError, require
 from trackmdp.imports import safe_children
 from trackmdp.signals import HEARD, handled
@@ -176,13 +175,10 @@ def _ray(workers: int, cluster: str, key: str) -> Iterator[Crew]:
     require("ray", "ray", f"{key}={cluster}")
     import ray
 
-    where: dict[str, Any] = {"address": cluster}
-    if cluster == "local":
-        where = {"address": "local", "num_cpus": workers, "include_dashboard": False}
     begun = not ray.is_initialized()
     if begun:
         with joining(key, cluster):
-            ray.init(logging_level=logging.ERROR, log_to_driver=False, **where)
+            ray.init(log_to_driver=False, **ray_options(cluster, workers))
 
     def run(work: Callable[[Piece], Result], jobs: Sequence[Piece]) -> list[Result]:
         # Ray itself begins a task again if its worker or machine was lost.

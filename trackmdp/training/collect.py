@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -14,13 +14,16 @@ from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, Mu
 from trackmdp.config import TrainConfig
 from trackmdp.config.learning import CollectorConfig, RayWorkersConfig, WorkersConfig
 from trackmdp.config.registry import maker
-from trackmdp.errors import RunError
+from trackmdp.errors import RunError, first_line
 from trackmdp.imports import safe_children
-from trackmdp.seeding import derive
+from trackmdp.seeding import seed_global
 from trackmdp.solvers.workers import end_with_parent
 from trackmdp.training.devices import make_device
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.group import Subject
+
+MakeEnv: TypeAlias = "partial[TrackEnv]"
+"""Makes the environments that are stepped together; `stream` is the one argument left open."""
 
 
 def make_collector(
@@ -31,65 +34,78 @@ def make_collector(
     *,
     done: int = 0,
 ) -> BaseCollector:
-    """The source of the frames that are left after the first `done`, from the config's collector."""
-    return maker(cfg.collector)(
-        problem, policy, cfg.collector, seed=cfg.seed, device=device, done=done
-    )
+    """The source of the frames that are left, from the config's collector.
+
+    Args:
+        cfg: of the run.
+        problem: the world or the tracks.
+        policy: acts, on `device`.
+        device: the learner's, where the batches end up.
+        done: of `total_frames`, made up to whole batches, so many were collected by an earlier process.
+    """
+    chosen = cfg.collector
+    place, batch = make_device(chosen.device, "collector.device"), chosen.frames_per_batch
+    env = partial(TrackEnv, problem, chosen.envs, seed=cfg.seed, device=place)
+    # With these flags, and the environment's own `_step_and_maybe_reset`, TorchRL's collectors are as fast as a loop by
+    # hand.
+    common = {
+        "frames_per_batch": batch,
+        # The rest, rounded up to whole batches: 100,000 frames in batches of 30,000 are 120,000, or 60,000 where
+        # 60,000 are done.
+        "total_frames": -(-(chosen.total_frames - done) // batch) * batch,
+        # True would wrap the environment in an InitTracker: a transformed environment does not call the environment's
+        # own `_step_and_maybe_reset`, and is slower. Left unset, TorchRL warns.
+        "auto_register_policy_transforms": False,
+        "env_device": place,
+        "policy_device": device,
+        "storing_device": device,
+        "trust_policy": True,  # a policy without parameters (all sensors on) lives on any device
+    }
+    return maker(chosen)(env, policy, chosen, common, done)
 
 
 def single(
-    problem: Subject,
+    env: MakeEnv,
     policy: TensorDictModuleBase,
-    cfg: CollectorConfig,
-    *,
-    seed: int,
-    device: torch.device,
-    done: int,
+    cfg: CollectorConfig,  # noqa: ARG001
+    common: dict[str, Any],
+    done: int,  # noqa: ARG001
 ) -> BaseCollector:
     """A collector of batches `[B, time]` in this process; its frames are env steps.
 
     Args:
-        problem: the world or the tracks.
-        policy: acts, on `device`.
-        cfg: frames, environments and their device.
-        seed: of the run.
-        device: the learner's, where the batches end up.
-        done: of `cfg.total_frames`, made up to whole batches, so many were collected by an earlier process.
+        env: makes the environments.
+        policy: acts.
+        cfg: options of the collector.
+        common: arguments that all of TorchRL's collectors are given.
+        done: frames that an earlier process collected.
     """
-    env, common = _env_options(cfg, seed), _common(cfg, device, done)
     # Trajectory numbers are read by no learner here, take a tenth of the collecting time, and would be one more state
     # to save. A buffer would be copied out for every batch: without one each batch is stacked once and is the caller's.
     once = {"use_buffers": False, "return_same_td": True}
-    return Collector(TrackEnv(problem, **env), policy, track_traj_ids=False, **once, **common)
+    return Collector(env(), policy, track_traj_ids=False, **once, **common)
 
 
 def _in_workers(
     kind: Callable[..., BaseCollector],
-    problem: Subject,
+    env: MakeEnv,
     policy: TensorDictModuleBase,
     cfg: WorkersConfig,
-    *,
-    seed: int,
-    device: torch.device,
-    done: int = 0,
+    common: dict[str, Any],
+    done: int,
 ) -> BaseCollector:
     """A collector of TorchRL's `kind` in worker processes; arguments as for `single`.
 
     Raises:
         RunError: a worker ended before it could collect.
     """
-    env = _env_options(cfg, seed)
-    # A resumed run's workers have streams of their own (`done`), not the first ones again.
-    workers = [
-        partial(_worker_env, problem, f"{worker}-{done}", env) for worker in range(cfg.workers)
-    ]
     threads = {"num_threads": torch.get_num_threads(), "num_sub_threads": cfg.threads}
     with safe_children():
         try:
-            return kind(workers, policy, **threads, **_common(cfg, device, done))
+            return kind(_of_workers(_worker_env, env, cfg, done), policy, **threads, **common)
         except (RuntimeError, EOFError, OSError) as error:
             # TorchRL's message has the worker's whole traceback from its second line on.
-            reason = (str(error).splitlines() or [type(error).__name__])[0].strip()
+            reason = first_line(error)
             raise RunError(f"collector={cfg.name}: a worker did not start ({reason})") from error
 
 
@@ -100,12 +116,10 @@ multi_async = partial(_in_workers, MultiAsyncCollector)
 
 
 def ray(
-    problem: Subject,
+    env: MakeEnv,
     policy: TensorDictModuleBase,
     cfg: RayWorkersConfig,
-    *,
-    seed: int,
-    device: torch.device,
+    common: dict[str, Any],
     done: int,
 ) -> BaseCollector:
     """A collector in the workers of a Ray cluster; arguments as for `single`.
@@ -115,52 +129,32 @@ def ray(
     """
     from trackmdp.training import on_ray
 
-    env = _env_options(cfg, seed)
-    workers = [
-        partial(_remote_env, problem, f"{worker}-{done}", env, cfg.threads)
-        for worker in range(cfg.workers)
-    ]
-    return on_ray.make_ray_collector(workers, policy, cfg, _common(cfg, device, done))
+    workers = _of_workers(partial(_remote_env, cfg.threads), env, cfg, done)
+    return on_ray.make_ray_collector(workers, policy, cfg, common)
 
 
-def _env_options(cfg: CollectorConfig, seed: int) -> dict[str, Any]:
-    device = make_device(cfg.device, "collector.device")
-    return {"batch_size": cfg.envs, "seed": seed, "device": device}
+def _of_workers(
+    make: Callable[[MakeEnv, str], TrackEnv], env: MakeEnv, cfg: WorkersConfig, done: int
+) -> list[Callable[[], TrackEnv]]:
+    # A resumed run's workers have streams of their own (`done`), not the first ones again.
+    return [partial(make, env, f"{worker}-{done}") for worker in range(cfg.workers)]
 
 
-def _common(cfg: CollectorConfig, device: torch.device, done: int) -> dict[str, Any]:
-    """The arguments that all of TorchRL's collectors are given.
-
-    With these flags, and the environment's own `_step_and_maybe_reset`, they are as fast as a loop by hand.
-    """
-    return {
-        "frames_per_batch": cfg.frames_per_batch,
-        # The rest, rounded up to whole batches: 100,000 frames in batches of 30,000 are 120,000, or 60,000 where
-        # 60,000 are done.
-        "total_frames": -(-(cfg.total_frames - done) // cfg.frames_per_batch)
-        * cfg.frames_per_batch,
-        # True would wrap the environment in an InitTracker: a transformed environment does not call the environment's
-        # own `_step_and_maybe_reset`, and is slower. Left unset, TorchRL warns.
-        "auto_register_policy_transforms": False,
-        "env_device": make_device(cfg.device, "collector.device"),
-        "policy_device": device,
-        "storing_device": device,
-        "trust_policy": True,  # a policy without parameters (all sensors on) lives on any device
-    }
-
-
-def _worker_env(world: Subject, worker: str, env: dict[str, Any]) -> TrackEnv:
-    """Built in a worker process: its own stream for the targets, and for the actions sampled there."""
+def _worker_env(env: MakeEnv, worker: str) -> TrackEnv:
     # Ctrl-C, and a scheduler's SIGTERM, go to the workers as well. They must not die of them: the learner would wait
     # for an answer of theirs while it should save. It requests their end, and kills the others.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     end_with_parent()
-    torch.manual_seed(derive(env["seed"], "torch", worker))
-    return TrackEnv(world, stream=f"world-{worker}", **env)
+    return _own_env(env, worker)
 
 
-def _remote_env(world: Subject, worker: str, env: dict[str, Any], threads: int) -> TrackEnv:
+def _remote_env(threads: int, env: MakeEnv, worker: str) -> TrackEnv:
     torch.set_num_threads(threads)
-    torch.manual_seed(derive(env["seed"], "torch", worker))
-    return TrackEnv(world, stream=f"world-{worker}", **env)
+    return _own_env(env, worker)
+
+
+def _own_env(env: MakeEnv, worker: str) -> TrackEnv:
+    """Built in a worker process: its own stream for the targets, and for the actions sampled there."""
+    seed_global(env.keywords["seed"], worker)
+    return env(stream=f"world-{worker}")

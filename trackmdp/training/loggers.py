@@ -25,7 +25,7 @@ from trackmdp.errors import Preempted, RunError
 from trackmdp.notebook.drawing import drawn
 from trackmdp.solvers.evaluation import figures
 from trackmdp.training.callbacks import Callback, Row, Training
-from trackmdp.untrusted import decoded, opened
+from trackmdp.untrusted import decoded, opened, reason
 from trackmdp.world.group import Group
 
 
@@ -410,5 +410,4 @@ def _answering(name: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # any error of the package, its network or its database
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise RunError(f"log=[{name}]: {reason}") from error
+        raise RunError(f"log=[{name}]: {reason(error)}") from error

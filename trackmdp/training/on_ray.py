@@ -11,9 +11,9 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector
 from torchrl.collectors.distributed import RayCollector
 
-from trackmdp.cluster import joining
+from trackmdp.cluster import joining, ray_options
 from trackmdp.config.learning import RayWorkersConfig
-from trackmdp.errors import require
+from trackmdp.errors import first_line, require
 from trackmdp.world.env import TrackEnv
 
 _STORE = 2**30
@@ -40,12 +40,13 @@ def make_ray_collector(
     require("ray", "ray", "collector=ray")
     # RayCollector has no such argument; the collectors that it makes in its workers have.
     register = common.pop("auto_register_policy_transforms")
+    cores = max(1, round(cfg.workers * cfg.cpus_per_worker))
     with joining("collector.address", cfg.address):
         made = _Collector(
             list(envs),
             policy,
             sync=True,
-            ray_init_config=_cluster(cfg),
+            ray_init_config=ray_options(cfg.address, cores, _STORE) | {"log_to_driver": False},
             # Both are always given: TorchRL asks for 0.2 GPUs by default, and on a cluster without GPUs no worker
             # would ever start.
             remote_configs={"num_cpus": cfg.cpus_per_worker, "num_gpus": cfg.gpus_per_worker},
@@ -76,27 +77,9 @@ def _losing() -> Iterator[None]:
     try:
         yield
     except RayError as error:
-        raise RuntimeError(f"a worker was lost: {str(error).splitlines()[0]}") from error
+        raise RuntimeError(f"a worker was lost: {first_line(error)}") from error
 
 
 def _rows(batch: TensorDictBase) -> TensorDictBase:
     """`[workers, envs, time]` as `[workers * envs, time]`."""
     return batch.flatten(0, 1)
-
-
-def _cluster(cfg: RayWorkersConfig) -> dict[str, Any]:
-    """Arguments of `ray.init`; a cluster that is joined has its own resources."""
-    quiet: dict[str, Any] = {"logging_level": "error", "log_to_driver": False}
-    if cfg.address is not None:
-        # Ray refuses num_cpus and object_store_memory together with an address: they were fixed when the cluster
-        # started.
-        return {"address": cfg.address, **quiet}
-    cpus = max(1, round(cfg.workers * cfg.cpus_per_worker))
-    # "local": without an address Ray would join a cluster that runs here, or the one that RAY_ADDRESS names.
-    started = {
-        "address": "local",
-        "num_cpus": cpus,
-        "object_store_memory": _STORE,
-        "include_dashboard": False,
-    }
-    return started | quiet

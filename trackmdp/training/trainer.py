@@ -29,7 +29,7 @@ from trackmdp.training.group_run import evaluator_of, learned_policy
 from trackmdp.training.inputs import with_own_classes, write_inputs
 from trackmdp.training.loggers import make_loggers
 from trackmdp.training.state import Checkpoints, find, restore, take_weights
-from trackmdp.untrusted import decoded
+from trackmdp.untrusted import decoded, reason
 from trackmdp.world.group import Subject
 
 
@@ -279,7 +279,7 @@ def _named(iteration: int) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, OSError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
+        why = f"collecting broke down ({reason(error)})"
         raise RunError(
-            f"iteration {iteration}: collecting broke down ({reason}); resume=auto resumes from the last checkpoint"
+            f"iteration {iteration}: {why}; resume=auto resumes from the last checkpoint"
         ) from error

@@ -15,7 +15,7 @@ from typing import Any
 from trackmdp.app.sweep import process
 from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.process import fail, run_job, stop_signal
-from trackmdp.cluster import joining
+from trackmdp.cluster import joining, ray_options
 from trackmdp.config import TrainConfig, sweeping
 from trackmdp.errors import FAILED
 from trackmdp.signals import handled
@@ -77,14 +77,8 @@ def run_on_ray(cfg: sweeping.RayConfig, jobs: Sequence[Job]) -> None:
     """
     import ray
 
-    # Of a cluster that runs already Ray takes no word about its memory and processors.
-    options: dict[str, Any] = {"address": cfg.address, "logging_level": "error"}
-    if cfg.address is None:
-        # Without an address Ray would join a cluster that runs here, or the one that RAY_ADDRESS names.
-        options |= {"address": "local", "num_cpus": cfg.num_cpus, "object_store_memory": _STORE}
-        options["include_dashboard"] = False
     with joining("hydra.launcher.address", cfg.address):
-        ray.init(**options)
+        ray.init(**ray_options(cfg.address, cfg.num_cpus, _STORE))
     try:
         # No retries by Ray: a run that was killed for lack of memory would be again; the sweep launches the rest
         # itself.

@@ -32,7 +32,7 @@ from trackmdp.training.folders import (
     write_plan,
 )
 from trackmdp.training.lock import locked
-from trackmdp.untrusted import known_object, no_formula
+from trackmdp.untrusted import known_object, no_formula, reason
 
 TABLE = "runs.csv"
 
@@ -112,7 +112,7 @@ def _run(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
         # A launcher's worker may die before its run begins; an old result would then be taken for the new one.
         for name in (FAILED_FILE, DONE, SUMMARY):
             (job.folder / name).unlink(missing_ok=True)
-    reason = "it was launched, and left nothing"
+    why = "it was launched, and left nothing"
     # A pool gives up all its jobs when a worker is killed. Finished runs are in their folders, so that
     # the rest can simply be launched again.
     for _ in range(_ROUNDS):
@@ -126,14 +126,12 @@ def _run(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
         except UserError:  # no such cluster, which the next round would not find either
             raise
         except Exception as error:
-            reason = (
-                f"the launcher broke down: {type(error).__name__}: {' '.join(str(error).split())}"
-            )
-            sys.stderr.write(f"{reason}\n")
+            why = f"the launcher broke down: {type(error).__name__}: {reason(error)}"
+            sys.stderr.write(f"{why}\n")
         # Not "running": another process holds that folder, and is at it.
         jobs = [job for job in jobs if run_of(job.folder).state in ("cut", "waiting")]
     for job in jobs if not stop.received else ():
-        fail(job, Outcome(FAILED, reason=reason))
+        fail(job, Outcome(FAILED, reason=why))
 
 
 class _Stop(Signals):

@@ -22,6 +22,7 @@ from trackmdp.config.sweeping import OptunaConfig
 from trackmdp.errors import UserError
 from trackmdp.seeding import derive
 from trackmdp.training.folders import run_of
+from trackmdp.untrusted import reason
 
 STUDY = "study.db"
 """File in the sweep's folder that holds the study, where no other storage is named."""
@@ -185,9 +186,8 @@ def _study(cfg: OptunaConfig, folder: Path) -> Iterator[Any]:
     try:
         storage = optuna.storages.RDBStorage(cfg.storage or f"sqlite:///{folder / STUDY}")
     except Exception as error:  # of many kinds, those of the data base's driver among them
-        reason = " ".join(str(error).split())
         raise UserError(
-            f"hydra.sweeper.storage={cfg.storage}: expected a data base's URL ({reason})"
+            f"hydra.sweeper.storage={cfg.storage}: expected a data base's URL ({reason(error)})"
         ) from error
     try:
         way = _DIRECTIONS[cfg.objective]
