@@ -13,10 +13,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from typing import Any
 
-from trackmdp.config import GROUPS, ROOTS, Node, Option, options
+from omegaconf import MISSING
+
+from trackmdp.config import GROUPS, ROOTS, Option, options
 from trackmdp.config.checks import check_choice
+from trackmdp.config.compose import command_values, known_options
 from trackmdp.config.options import listed, several
 from trackmdp.config.registry import choice_values, load_plugins, read_values
+from trackmdp.config.resume import at_key
 from trackmdp.config.sweeping import PLUGINS
 
 EXAMPLES = {
@@ -102,8 +106,6 @@ def manual(command: str, words: Sequence[str] = ()) -> str:
     # Installed packages add choices, which are listed like our own.
     load_plugins()
     typed = _choices(command, words)
-    # The YAML files are read as they stand: composing would need a choice for every group, and the help is about all.
-    values = read_values(command)
     blocks = [
         f"usage: trackmdp {command} [option=value ...] [group=choice ...]",
         *_wrapped(_about(ROOTS[command])),
@@ -114,35 +116,29 @@ def manual(command: str, words: Sequence[str] = ()) -> str:
         # Launchers and sweepers are read by multirun alone.
         chosen = f"-m {chosen}" if any(group.startswith("hydra/") for group in typed) else chosen
         blocks += ["Examples", f"  trackmdp {command} {chosen}"]
-        made = [(group, _names(names)) for group, names in typed.items()]
-        for group, name in ((group, name) for group, names in made for name in names):
-            blocks += [*_example(command, chosen, group, name), *_choice(group, name)]
+        for group, names in typed.items():
+            for name in _names(names):
+                blocks += [*_example(command, chosen, group, name), *_choice(group, name)]
         return "\n".join([*blocks, "", f"trackmdp {command} --help lists every other option.", ""])
     blocks += ["Examples", *(f"  {line}" for line in EXAMPLES[command]), ""]
     for flag, text in _FLAGS.items():
         blocks += _described(flag, text)
-    if "all" in words:
-        return "\n".join([*blocks, *_all(command, values), ""])
-    return "\n".join([*blocks, *_most_used(command, values), ""])
+    # Not composed, which needs a choice for every group.
+    values = command_values(command, {})
+    more = _all(command, values) if "all" in words else _most_used(command, values)
+    return "\n".join([*blocks, *more, ""])
 
 
 def _most_used(command: str, values: dict[str, Any]) -> Iterator[str]:
     """The options of `USED`, then one line for the choices of each group."""
     yield from ("", "Options used most")
-    schema, chosen = options(ROOTS[command]), _defaults(values)
+    known = known_options(values, ROOTS[command])
     for key in USED[command]:
-        part, _, name = key.rpartition(".")
-        item, given = _looked_up(schema, values, chosen, part)
-        described = item[name]
-        assert isinstance(described, Option)
-        yield from _described(f"{key}={_shown(key, given.get(name))}", described.help)
+        yield from _described(f"{key}={_shown(key, at_key(values, key))}", known[key].help)
     yield from ("", "Choices")
-    for key in schema:
+    for key in values:
         if key in GROUPS:
-            default = chosen.get(key)
-            default = listed(default) if isinstance(default, list) else default or "none chosen"
-            text = f"{'|'.join(GROUPS[key])} (default: {default})"
-            yield from _wrapped(f"  {key}={text}")
+            yield from _wrapped(f"  {_offered(key, values)}")
     yield from (
         "",
         f"trackmdp {command} --help all lists every option with its range and unit,",
@@ -150,56 +146,31 @@ def _most_used(command: str, values: dict[str, Any]) -> Iterator[str]:
     )
 
 
-def _looked_up(
-    schema: dict[str, Option | Node],
-    values: dict[str, Any],
-    chosen: dict[str, Any],
-    part: str,
-) -> tuple[dict[str, Option | Node], dict[str, Any]]:
-    """The options and the values below `part`: the command itself (empty), a section, or the choice of a group."""
-    if not part:
-        return schema, values
-    if part in GROUPS:
-        return options(GROUPS[part][chosen[part]]), choice_values(part, chosen[part])
-    section = schema[part]
-    assert isinstance(section, Node)
-    return options(section.schema), values.get(part) or {}
-
-
-def _defaults(values: dict[str, Any]) -> dict[str, Any]:
-    """Group -> the choice made by the command's file in `conf/`."""
-    return {
-        key: name
-        for each in values["defaults"]
-        if isinstance(each, dict)
-        for key, name in each.items()
-    }
+def _offered(group: str, values: dict[str, Any]) -> str:
+    """The choices of a group, and the one that the command makes by default."""
+    default = "none chosen"
+    if (node := values[group]) is not None:
+        default = node["name"] if "name" in node else listed(node)
+    return f"{group}={'|'.join(GROUPS[group])} (default: {default})"
 
 
 def _all(command: str, values: dict[str, Any]) -> Iterator[str]:
     """Every option of the command, those of every choice of its groups among them."""
     yield from ("", "Options")
-    chosen = _defaults(values)
     schema = options(ROOTS[command])
     # those of the command itself before its groups
     for key, item in sorted(schema.items(), key=lambda each: not isinstance(each[1], Option)):
         if isinstance(item, Option):
             yield from _entry(key, item, values.get(key))
-            continue
-        if key not in GROUPS:
-            yield from (
-                "",
-                *_wrapped(f"{key}: {_about(item.schema)}"),
-                *_entries(item.schema, values.get(key), f"{key}."),
-            )
-            continue
-        line = f"{key}={'|'.join(GROUPS[key])} (default: {chosen.get(key) or 'none chosen'})"
-        if item.several:
-            line = f"{key}={listed(GROUPS[key])}: any of them, none by {key}=[] (default: {listed(chosen[key])})"
-        yield from ("", *_wrapped(line))
-        for name in GROUPS[key]:
-            yield from _choice(key, name)
-    if "override hydra/sweeper" in chosen:
+        elif key in GROUPS:
+            any_number = "; any of them as a list, none by []" if item.several else ""
+            yield from ("", *_wrapped(f"{_offered(key, values)}{any_number}"))
+            for name in GROUPS[key]:
+                yield from _choice(key, name)
+        else:
+            yield from ("", *_wrapped(f"{key}: {_about(item.schema)}"))
+            yield from _entries(item.schema, values.get(key), f"{key}.")
+    if any("override hydra/sweeper" in each for each in read_values(command)["defaults"]):
         for group in (f"hydra/{part}" for part in PLUGINS):
             default = next(iter(GROUPS[group]))
             yield from (
@@ -251,8 +222,7 @@ def _example(command: str, chosen: str, group: str, name: str) -> Iterator[str]:
         if isinstance(options(GROUPS[group][name]).get(key), Option) and not isinstance(
             value, (dict, list)
         ):
-            # "???" is OmegaConf's mark of a value that must be given.
-            shown = "FILE" if value == "???" else json.dumps(value).strip('"')
+            shown = "FILE" if value == MISSING else json.dumps(value).strip('"')
             # An interpolation is not something to type after a `=`: the shell would take the `$`.
             if "$" not in shown:
                 yield f"  trackmdp {command} {chosen} {_prefix(group, name)}{key}={shown}"
@@ -279,7 +249,7 @@ def _entry(key: str, described: Option, value: Any) -> list[str]:
 
 def _shown(key: str, value: Any) -> str:
     """The default as it is typed; an interpolation in angle brackets."""
-    shown = "" if value == "???" else json.dumps(value, ensure_ascii=False).strip('"')
+    shown = "" if value == MISSING else json.dumps(value, ensure_ascii=False).strip('"')
     shown = shown.replace("${.", f"${{{key.rpartition('.')[0]}.")
     # `${per_cell:1.0,${grid.size},10000}` is shown as <1 a cell, at least 10000>, `${algo.envs}` as <algo.envs>
     shown = re.sub(

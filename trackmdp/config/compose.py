@@ -44,7 +44,7 @@ def compose(
         UserError: a name, a type or a range is wrong, or a rule between options is broken.
     """
     typed, schema = dict(_by_option(overrides or {})), ROOTS[command]
-    values = _values(command, schema, typed)
+    values = command_values(command, typed)
     known = known_options(values, schema)
     # After all choices, so that `algo.epochs` is looked up among the options of the chosen algorithm.
     for key, value in typed.items():
@@ -60,9 +60,13 @@ def compose(
     return cfg
 
 
-def _values(command: str, schema: type[Any], typed: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of a command, and of its choices: those of the defaults list, unless another one is typed."""
-    root = read_values(command)
+def command_values(command: str, typed: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of a command, and of its choices: those of the defaults list, unless another one is typed.
+
+    Raises:
+        UserError: there is no such choice.
+    """
+    root, schema = read_values(command), ROOTS[command]
     pairs = (entry for entry in root["defaults"] if isinstance(entry, dict))
     chosen = {group: name for pair in pairs for group, name in pair.items()} | dict(typed)
     # The file also has `defaults` and `hydra`, for the command line alone.
