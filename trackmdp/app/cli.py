@@ -15,6 +15,7 @@ from pathlib import Path
 from trackmdp import __version__
 from trackmdp.errors import FAILED, INTERRUPTED, USER_MISTAKE, Preempted, RunError, UserError
 from trackmdp.imports import importing, leave_current_folder
+from trackmdp.untrusted import printable
 
 COMMANDS = {
     "train": "learn a policy without the motion model, and evaluate it exactly",
@@ -27,23 +28,6 @@ COMMANDS = {
     "replay": "list, play, verify, recover logged episodes, or show one as a page",
     "report": "make figures, tables and a web page of a sweep, or watch it run",
 }
-
-
-_OF_FILES = {
-    getattr(errno, name)
-    for name in (
-        "EACCES",
-        "EDQUOT",
-        "EISDIR",
-        "ELOOP",
-        "ENAMETOOLONG",
-        "ENOSPC",
-        "ENOTDIR",
-        "EPERM",
-        "EROFS",
-    )
-}
-"""Errors of the file system that are reported by the file's name and the system's message, without a traceback."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -115,8 +99,8 @@ def _report(command: str, error: BaseException) -> int:
         status = USER_MISTAKE if isinstance(error, UserError) else FAILED
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             traceback.print_exception(error)
-    # Without a file's name it is about no file of the user, and is reported as a bug.
-    elif isinstance(error, OSError) and error.filename is not None and error.errno in _OF_FILES:
+    # Without a file's name it is about no file of the user, and one of theirs that is missing is a `UserError`.
+    elif isinstance(error, OSError) and error.filename and error.errno != errno.ENOENT:
         line = f"{error.filename}: {error.strerror}"
     elif (
         isinstance(error, MemoryError) or "can't allocate memory" in line
@@ -126,7 +110,7 @@ def _report(command: str, error: BaseException) -> int:
         traceback.print_exception(error)
         return status
     name = f"trackmdp {command}" if command in COMMANDS else "trackmdp"
-    sys.stderr.write(f"{name}: {_printable(line)}\n")
+    sys.stderr.write(f"{name}: {printable(' '.join(line.split()))}\n")
     return status
 
 
@@ -140,13 +124,6 @@ def _run(command: str, words: list[str]) -> int:
         from trackmdp.app.launch import launch
 
     return launch(command, words)
-
-
-def _printable(text: str) -> str:
-    """`text` in one line; control characters, such as an escape sequence in a file's name, are spelled out."""
-    return "".join(
-        each if each.isprintable() else ascii(each)[1:-1] for each in " ".join(text.split())
-    )
 
 
 def _example(names: list[str]) -> str:

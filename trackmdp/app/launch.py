@@ -34,8 +34,8 @@ from trackmdp.app.prepare import (
 from trackmdp.app.words import gathered, parsed, run_words
 from trackmdp.config import GROUPS, ROOTS
 from trackmdp.config.checks import validate
-from trackmdp.config.options import options
 from trackmdp.config.registry import maker
+from trackmdp.config.tree import build_config
 from trackmdp.errors import UserError, first_line
 
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
@@ -169,13 +169,11 @@ def _plugin(part: str, node: DictConfig) -> Any:
         UserError: a value is out of its range, the option chosen is none of ours, or a package for it is missing.
     """
     known = GROUPS[f"hydra/{part}"]
-    schema = OmegaConf.get_type(node)
+    schema: Any = OmegaConf.get_type(node)
     if schema not in known.values():
         raise UserError(f"hydra/{part}: expected one of {', '.join(known)}")
-    assert schema is not None
-    if more := sorted(map(str, node.keys() - options(schema).keys())):
-        raise UserError(f"hydra.{part}.{more[0]}: unknown option")
-    typed: Any = OmegaConf.to_object(node)
+    plain = OmegaConf.to_container(node, resolve=True)
+    typed = build_config(plain, schema, f"hydra.{part}.")
     validate(typed, f"hydra.{part}")
     return typed
 
@@ -207,17 +205,6 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     if args.experimental_rerun is not None:
         raise UserError(
             "--experimental-rerun: not offered, it would unpickle a file; start from the run's config.yaml"
-        )
-    asked = [
-        args.cfg,
-        args.info,
-        args.hydra_help or None,
-        args.shell_completion or None,
-        args.multirun or None,
-    ]
-    if sum(each is not None for each in [*asked, args.run or None]) > 1:
-        raise UserError(
-            "expected only one of --run, --multirun, --cfg, --info, --hydra-help and --shell-completion"
         )
     if args.cfg is None and (args.resolve or args.package is not None):
         raise UserError("--resolve and --package: only together with --cfg")
@@ -269,33 +256,21 @@ def _parser() -> argparse.ArgumentParser:
     flag = parser.add_argument
     flag("overrides", nargs="*", help="option=value, to set a value or choose from a group")
     flag("--help", "-h", action="store_true", help="the command's help")
-    flag("--hydra-help", action="store_true", help="Hydra's help")
     flag("--version", action="version", version=f"trackmdp {__version__}", help="show the version")
-    flag("--cfg", "-c", choices=["job", "hydra", "all"], help="show the config instead of running")
     flag("--resolve", action="store_true", help="with --cfg: resolve interpolations")
     flag("--package", "-p", help="with --cfg: the part to show, such as algo")
-    flag("--run", "-r", action="store_true", help="run once")
-    flag(
-        "--multirun",
-        "-m",
-        action="store_true",
-        help="run once for every combination of option=a,b,c",
-    )
-    flag(
-        "--shell-completion",
-        "-sc",
-        action="store_true",
-        help="install=bash, uninstall=bash, query=bash",
-    )
     flag("--config-name", "-cn", help="the primary config in place of the command's")
     flag("--config-dir", "-cd", action="append", default=[], help="a folder with further choices")
     flag("--experimental-rerun", help="not offered")
-    flag(
-        "--info",
-        "-i",
-        const="all",
-        nargs="?",
-        choices=_INFO,
-        help="show how the config is composed",
-    )
+    one_of = parser.add_mutually_exclusive_group().add_argument
+    one_of("--run", "-r", action="store_true", help="run once")
+    every = "run once for every combination of option=a,b,c"
+    one_of("--multirun", "-m", action="store_true", help=every)
+    shown = ["job", "hydra", "all"]
+    one_of("--cfg", "-c", choices=shown, help="show the config instead of running")
+    how = "show how the config is composed"
+    one_of("--info", "-i", const="all", nargs="?", choices=_INFO, help=how)
+    one_of("--hydra-help", action="store_true", help="Hydra's help")
+    completing = "install=bash, uninstall=bash, query=bash"
+    one_of("--shell-completion", "-sc", action="store_true", help=completing)
     return parser

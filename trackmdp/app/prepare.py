@@ -19,7 +19,7 @@ from trackmdp.config.checks import refuse_ignored
 from trackmdp.config.compose import from_hydra
 from trackmdp.config.learning import file_of_classes
 from trackmdp.config.logs import require_packages
-from trackmdp.config.resume import continued, key_of, run_folder
+from trackmdp.config.resume import by_key, continued, key_of, run_folder
 from trackmdp.errors import UserError, first_line
 from trackmdp.imports import importing
 
@@ -47,8 +47,7 @@ def _refuse_ignored(typed: CommandConfig, composed: DictConfig) -> None:
     if "hydra" in composed:
         # As typed: an interpolation in a word that a later one replaces may be of no resolver there is.
         as_typed: Any = OmegaConf.to_container(composed.hydra.overrides.task, resolve=False)
-        words = (word.lstrip("+~").partition("=") for word in as_typed)
-        refuse_ignored(typed, {key: value for key, _, value in words})
+        refuse_ignored(typed, by_key(as_typed))
 
 
 @dataclass(frozen=True)

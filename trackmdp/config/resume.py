@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +97,12 @@ def key_of(word: str) -> str:
     """The dotted key that an override sets."""
     # Hydra's grammar: `algo.epochs=3`, `+key=1` adds, `~key` removes, `group@package=name`, `hydra/launcher=joblib`.
     return word.lstrip("+~").split("=", 1)[0].split("@")[0].replace("/", ".")
+
+
+def by_key(words: Iterable[str]) -> dict[str, str]:
+    """The text of each key's value, as typed."""
+    pairs = (word.lstrip("+~").partition("=") for word in words)
+    return {key: value for key, _, value in pairs}
 
 
 def at_key(plain: Any, key: str) -> Any:

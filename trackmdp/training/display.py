@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -15,6 +16,7 @@ from rich.status import Status
 from rich.table import Table
 from rich.text import Text
 
+from trackmdp.signals import handled, stop
 from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.untrusted import printable
 
@@ -123,13 +125,16 @@ def reporting(
 ) -> Iterator[Callable[[_T], None]]:
     """Show a search as it goes on: one changing line at a terminal, a plain line now and then when piped.
 
+    A scheduler's signals end it as Ctrl-C does, with its workers; by themselves they would end this process alone.
+
     Args:
         console: where.
         title: before each line.
         line_of: a progress in words.
     """
     last = time.monotonic()
-    with console.status(title) as status:
+    ended = handled(stop, signal.SIGTERM, signal.SIGUSR1)
+    with ended, console.status(title) as status:
 
         def show(progress: _T) -> None:
             nonlocal last

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import multiprocessing
 import os
 import subprocess
 import sys
@@ -32,7 +33,7 @@ TINY = (
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty current folder, and runs that begin as a copy of this process, with all that is patched in it."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(process, "METHOD", "fork")
+    monkeypatch.setattr(process, "context_for", lambda _: multiprocessing.get_context("fork"))
     return tmp_path
 
 

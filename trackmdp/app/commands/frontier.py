@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ from rich.console import Console
 from trackmdp.config import FrontierConfig
 from trackmdp.durable import csv_text, own_folder, write_bytes, write_json, write_text
 from trackmdp.policies.saved import sets_name, write_sets
-from trackmdp.signals import handled, stop
 from trackmdp.solvers.frontier import FrontierProgress, trace
 from trackmdp.solvers.tradeoff import Corner, Mixture, Tradeoff
 from trackmdp.training.display import make_console, reporting, table
@@ -33,9 +31,7 @@ def run(cfg: FrontierConfig, folder: Path, world: Problem) -> float:
         UserError: no policy has the accuracy asked for; the files are written by then.
     """
     console = make_console(cfg.quiet)
-    # A scheduler stops the command by them; it ends in one line.
-    heard = handled(stop, signal.SIGTERM, signal.SIGUSR1)
-    with heard, reporting(console, f"frontier {cfg.solver.name}", _progress) as show:
+    with reporting(console, f"frontier {cfg.solver.name}", _progress) as show:
         found = trace(world, cfg.solver, cfg.resolution, show)
     rows = [_row(number, corner, found) for number, corner in enumerate(found.corners)]
     for number, corner in enumerate(found.corners):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ from trackmdp.config import SolveConfig
 from trackmdp.durable import own_folder, write_json
 from trackmdp.errors import UserError
 from trackmdp.policies.saved import sets_name, write_sets
-from trackmdp.signals import handled, stop
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluation import figures, regret_per_step
 from trackmdp.solvers.frontier import trace
@@ -44,9 +42,7 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem) -> float:
     world = modelled(problem, "solve")
     if cfg.targets.count > 1:
         return _several(cfg, world, folder, console)
-    # As Ctrl-C they end the workers in order; by themselves they would end this process alone.
-    stopping = handled(stop, signal.SIGTERM, signal.SIGUSR1)
-    with stopping, reporting(console, f"solve {cfg.solver.name}", _progress) as show:
+    with reporting(console, f"solve {cfg.solver.name}", _progress) as show:
         solution = run_solver(world, cfg.solver, show, cfg.partition)
     bound = {name: float(each(world).mean()) for name, each in _BOUNDS.items()}
     arrays = write_sets(folder, solution.table, value=solution.value, upper_value=solution.bound)
@@ -74,8 +70,7 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem) -> float:
 
 def _several(cfg: SolveConfig, world: World, folder: Path, at: Console) -> float:
     """Write `solution.json` and the sets of a single target; returns the AIHTR of separate trackers."""
-    stopping = handled(stop, signal.SIGTERM, signal.SIGUSR1)
-    with stopping, reporting(at, f"solve {cfg.solver.name}", _progress) as show:
+    with reporting(at, f"solve {cfg.solver.name}", _progress) as show:
         found = solve_group(Group([world] * cfg.targets.count), cfg.solver, show, cfg.partition)
     single, steps = found.singles[0], found.group.expected_steps
     arrays = write_sets(folder, single.table, value=single.value)

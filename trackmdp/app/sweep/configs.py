@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +16,12 @@ from trackmdp.app.words import Compose, parsed
 from trackmdp.config import CommandConfig
 from trackmdp.config.checks import refuse_ignored, validate
 from trackmdp.config.options import as_float, leaves
+from trackmdp.config.resume import by_key
 from trackmdp.config.tree import flatten
 from trackmdp.errors import UserError
 
 Numbers = dict[str, int | float]
 """Dotted option -> its value."""
-
-
-@dataclass(frozen=True)
-class _Composed:
-    """A config, and the kinds of its options."""
-
-    cfg: CommandConfig
-    kinds: Mapping[str, Any]
 
 
 class Configs:
@@ -46,7 +39,7 @@ class Configs:
         self._command, self._compose = command, compose
         self._read: dict[str, Numbers] = {}
         self._tied: set[str] = set()
-        self._known: dict[tuple[str, ...], _Composed] = {}
+        self._known: dict[tuple[str, ...], CommandConfig] = {}
 
     def __call__(self, words: Sequence[str]) -> tuple[CommandConfig | None, str]:
         """The config of `words`, after every check that needs no file; or None and the reason of its refusal.
@@ -93,30 +86,32 @@ class Configs:
         self, words: Sequence[str], numbers: Numbers, cfg: CommandConfig, composed: DictConfig
     ) -> None:
         """Keep a config for other numbers, where all of them can be put in their places."""
-        kinds = {key: described.kind for key, described, _ in leaves(cfg)}
-        referred = _referred(composed)
+        kinds, referred = _kinds(cfg), _referred(composed)
         for key, value in numbers.items():
             kind = kinds.get(key)
             fits = kind in (type(value), Any) or (type(value), kind) == (int, float)
             if referred & {*key.split(".")} or not fits:
                 self._tied.add(key)
-        self._known[self._split(words)[0]] = _Composed(cfg, kinds)
+        self._known[self._split(words)[0]] = cfg
 
 
-def _changed(known: _Composed, words: Sequence[str], numbers: Numbers) -> CommandConfig:
+def _kinds(cfg: CommandConfig) -> dict[str, Any]:
+    return {key: described.kind for key, described, _ in leaves(cfg)}
+
+
+def _changed(cfg: CommandConfig, words: Sequence[str], numbers: Numbers) -> CommandConfig:
     """A config with other numbers, checked.
 
     Raises:
         UserError: it is refused.
     """
-    cfg = known.cfg
+    kinds = _kinds(cfg)
     for key, value in numbers.items():
-        number = as_float(value) if known.kinds[key] is float and type(value) is int else value
+        number = as_float(value) if kinds[key] is float and type(value) is int else value
         cfg = _replaced(cfg, key.split("."), number)
     validate(cfg)
     if not getattr(cfg, "resume", None):
-        typed = (word.lstrip("+~").partition("=") for word in words)
-        refuse_ignored(cfg, {key: value for key, _, value in typed})
+        refuse_ignored(cfg, by_key(words))
     return cfg
 
 

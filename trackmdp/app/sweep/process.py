@@ -40,9 +40,6 @@ _PATIENCE = 60.0
 OUTPUT = "output.txt"
 """File in a run's folder for its output, where several runs print at once."""
 
-METHOD = "forkserver"
-"""The fork server imports the command once (seconds: torch, TorchRL); every run, of any launcher, is forked from it."""
-
 # For `stop_all`, which a scheduler's signal calls while another function waits for the process.
 _running: list[Any] = []
 _start_or_join = threading.RLock()
@@ -131,11 +128,9 @@ def context_for(command: str) -> Any:
     The fork server ignores the signals that a terminal or a scheduler sends to the whole process group: a run that it
     has forked needs it to report how it ended.
     """
-    context: Any = multiprocessing.get_context(METHOD)
-    if METHOD != "forkserver":
-        return context
-    # Importing torch takes seconds and memory; a fork shares both. Forking this process itself would copy its threads'
-    # locks in any state; a fork server has one thread.
+    context: Any = multiprocessing.get_context("forkserver")
+    # Importing torch takes seconds and memory: the server does it once, and every run of any launcher is forked from
+    # it. Forking this process itself would copy its threads' locks in any state; a fork server has one thread.
     context.set_forkserver_preload([f"trackmdp.app.commands.{command}"])
     # Python sets signal handlers from the main thread alone; hence "call it first in the main thread".
     ignored = _TERMINATING if threading.current_thread() is threading.main_thread() else ()

@@ -16,7 +16,7 @@ from trackmdp.app.sweep.launchers import threads_of
 from trackmdp.app.sweep.plan import Job, progress
 from trackmdp.app.sweep.process import STOP, Launch, Outcome, fail
 from trackmdp.config import TrainConfig
-from trackmdp.config.resume import continued
+from trackmdp.config.resume import by_key, continued
 from trackmdp.durable import csv_text, write_text
 from trackmdp.errors import FAILED, USER_MISTAKE, Preempted, UserError
 from trackmdp.signals import Signals
@@ -195,9 +195,7 @@ def write_table(sweep: Path, runs: Sequence[RunState]) -> None:
 
     Nothing in it depends on time, or on how often a run was interrupted.
     """
-    words = [
-        {word.partition("=")[0]: word.partition("=")[2] for word in run.overrides} for run in runs
-    ]
+    words = [by_key(run.overrides) for run in runs]
     # The union in order of appearance: runs of different blocks may have different options.
     keys = [key for key in dict.fromkeys(key for pairs in words for key in pairs) if key != "quiet"]
     found = [run_figures(run) for run in runs]

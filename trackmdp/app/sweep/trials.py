@@ -126,22 +126,19 @@ def _sampler(cfg: OptunaConfig, seed: int) -> Any:
 def _check(key: str, value: Any) -> None:
     """Refuse bounds between which there is nothing to draw, or a range that is too long to be listed."""
     if isinstance(value, IntervalSweep):
-        low, high, log = *_numbers(value.start, value.end), "log" in value.tags
+        ends: Any = value.start, value.end  # never None by Hydra's grammar, possibly by its types
+        (low, high), log = ends, "log" in value.tags
         if not (0 if log else -math.inf) < low < high < math.inf:
             raise UserError(
                 f"{key}=interval({low},{high}): expected interval(a,b) with {'0 < ' if log else ''}a < b"
             )
     if isinstance(value, RangeSweep):
-        start, stop, step = _numbers(value.start, value.stop, value.step)
+        bounds: Any = value.start, value.stop, value.step
+        start, stop, step = bounds
         span = stop - start if step > 0 else start - stop
         if not 0 < span <= MOST * abs(step):
             given = f"{key}=range({start},{stop},{step})"
             raise UserError(f"{given}: expected range(a,b,step) of 1 to {MOST:,} values")
-
-
-def _numbers(*bounds: Any) -> tuple[Any, ...]:
-    """The bounds: numbers by Hydra's grammar, but by its types possibly None."""
-    return bounds
 
 
 def _suggest(trial: Any, key: str, override: Override) -> Any:
