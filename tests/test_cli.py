@@ -117,7 +117,7 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         ("train --shell-completion x", "Expecting one subcommand"),
         ("train --cfg job --package nope", "--package nope: not in the config"),
         ("train --package grid", "--resolve and --package: only together with --cfg"),
-        ("train --cfg job -m", "expected only one of"),
+        ("train --cfg job -m", "argument --multirun/-m: not allowed with argument --cfg/-c"),
         (
             "train hydra.verbose={a:1}",
             "hydra.verbose: expected true, false, or a list of loggers",

@@ -12,14 +12,11 @@ from unittest.mock import Mock
 
 import pytest
 
-from tests.helpers import train_config
 from tests.typed import refused
 from trackmdp.app.sweep import launchers
-from trackmdp.cluster import joining
-from trackmdp.config.learning import RayWorkersConfig
+from trackmdp.cluster import joining, ray_options
 from trackmdp.config.sweeping import RayConfig
 from trackmdp.errors import UserError
-from trackmdp.training import on_ray
 
 BLOCKS = "solve grid.size=4 partition.block=2"
 
@@ -79,16 +76,20 @@ def test_without_its_cluster_a_command_leaves_no_folder(
 
 def test_a_cluster_of_our_own_is_none_that_runs_already(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ray's default is to join one that it finds on this machine."""
-    cfg = train_config("collector=ray").collector
-    assert isinstance(cfg, RayWorkersConfig)
-    assert on_ray._cluster(cfg)["address"] == "local"
     ray = Mock(**{"init.side_effect": ValueError})
     monkeypatch.setitem(sys.modules, "ray", ray)
     with pytest.raises(UserError):
         launchers.run_on_ray(
-            RayConfig(address=None, num_cpus=1, cpus_per_run=1.0, gpus_per_run=0.0), []
+            RayConfig(address=None, num_cpus=3, cpus_per_run=1.0, gpus_per_run=0.0), []
         )
-    assert ray.init.call_args.kwargs["address"] == "local"
+    asked = ray.init.call_args.kwargs
+    assert (asked["address"], asked["num_cpus"]) == ("local", 3)
+
+
+def test_a_cluster_that_is_joined_is_asked_for_no_resources() -> None:
+    """Ray refuses words about them."""
+    assert ray_options("auto", 3, 2**20) == {"address": "auto", "logging_level": "error"}
+    assert ray_options("local", 3)["num_cpus"] == 3
 
 
 @pytest.mark.parametrize("error", [RuntimeError, OSError, None])

@@ -7,7 +7,17 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from trackmdp.config.options import ChoiceConfig, choice, listed, option, refuse
+from trackmdp.config.options import (
+    GROUPS,
+    ChoiceConfig,
+    choice,
+    count_option,
+    file_option,
+    listed,
+    option,
+    refuse,
+    share_option,
+)
 from trackmdp.machine import SIZE_PATTERN
 
 
@@ -30,7 +40,6 @@ class BaselineConfig(ChoiceConfig):
 
 
 @choice("baseline", "qmdp", makes="trackmdp.solvers.rules:qmdp")
-@choice("solver", "qmdp", makes="trackmdp.solvers.rules:qmdp")
 class QmdpConfig(BaselineConfig):
     """Q_MDP: sense every cell with a predicted probability worth the sensor's price."""
 
@@ -70,19 +79,17 @@ class RandomKConfig(BaselineConfig):
 class MyopicConfig(BaselineConfig):
     """Sense the cells with a belief, given the misses so far, above a threshold."""
 
-    threshold: float | None = option(
-        "predicted probability from which a cell is sensed; null = c·p_in/r", ge=0, le=1
+    threshold: float | None = share_option(
+        "predicted probability from which a cell is sensed; null = c·p_in/r"
     )
 
 
 @choice("baseline", "clocked", makes="trackmdp.solvers.rules:clocked_policy")
-@choice("solver", "clocked", makes="trackmdp.solvers.rules:clocked_policy")
 class ClockedConfig(BaselineConfig):
     """Sets read off the clocked bound."""
 
 
 @choice("baseline", "fcr", makes="trackmdp.solvers.rules:fcr")
-@choice("solver", "fcr", makes="trackmdp.solvers.rules:fcr")
 class FcrConfig(BaselineConfig):
     """First cost reduction: decide as if nothing were observed any more."""
 
@@ -90,26 +97,24 @@ class FcrConfig(BaselineConfig):
 
 
 @choice("baseline", "lookahead", makes="trackmdp.solvers.lookahead:solve")
-@choice("solver", "lookahead", makes="trackmdp.solvers.lookahead:solve")
 class LookaheadConfig(BaselineConfig):
     """Plan some sets ahead, then count on a simpler value."""
 
     knows_footprints: ClassVar[bool] = False
     knows_budget: ClassVar[bool] = False
 
-    depth: int = option("sets planned ahead", unit="steps", ge=1, le=16)
+    depth: int = count_option("sets planned ahead", unit="steps", le=16)
     tail: str = option("value counted on after them", choices=("qmdp", "clocked"))
 
 
 @choice("baseline", "optimal", makes="trackmdp.solvers.optimal:solve")
-@choice("solver", "optimal", makes="trackmdp.solvers.optimal:solve")
 class OptimalConfig(BaselineConfig):
     """Policy iteration, search and branch and bound: the optimum with a certificate, or an honest bracket."""
 
     whole_episodes: ClassVar[bool] = True
 
-    nodes: int = option(
-        "choices of branch and bound after which the bracket is left as it is", unit="nodes", ge=1
+    nodes: int = count_option(
+        "choices of branch and bound after which the bracket is left as it is", unit="nodes"
     )
     time_limit: float | None = option(
         "stop after this time even so; the output then names it; null = never",
@@ -129,14 +134,14 @@ class SetsConfig(BaselineConfig):
     """The sets in a file of evaluate, solve, export or a run."""
 
     without_motion: ClassVar[bool] = True
-    file: str = option("the sets", expects="a sets.json, or a sets.npz or policy.npz", path=True)
+    file: str = file_option("the sets", "a sets.json, or a sets.npz or policy.npz")
 
 
 @choice("baseline", "playback", makes="trackmdp.policies.acting:Playback")
 class PlaybackConfig(BaselineConfig):
     """The actions of a logged episode again, step by step, independent of observations; none on after the last."""
 
-    file: str = option("the log", expects="a file written with log=[mcap]", path=True)
+    file: str = file_option("the log", "a file written with log=[mcap]")
     episode: int = option("number of the episode", ge=0)
 
     def check(self, key: str, root: Any) -> None:
@@ -151,3 +156,7 @@ class PlaybackConfig(BaselineConfig):
             raise refuse(
                 "episodes", 0, "at least 1 with baseline=playback, which is only simulated"
             )
+
+
+SOLVERS = ("qmdp", "clocked", "fcr", "lookahead", "optimal")
+GROUPS["solver"] = {name: GROUPS["baseline"][name] for name in SOLVERS}

@@ -5,22 +5,27 @@ from __future__ import annotations
 from typing import Any
 
 from trackmdp.cluster import ADDRESS
-from trackmdp.config.options import NodeConfig, listed, option, refuse
+from trackmdp.config.options import (
+    NodeConfig,
+    count_option,
+    listed,
+    option,
+    refuse,
+)
 
 
 class PartitionConfig(NodeConfig):
     """Blocks of the grid that plan or learn alone, for their own cells; the policy is valued on the whole grid."""
 
-    block: int | None = option("side of a block; null = the whole grid is one", unit="cells", ge=1)
+    block: int | None = count_option("side of a block; null = the whole grid is one", unit="cells")
     halo: int | None = option(
         "cells around its own that a block includes; null = R (T_max + 2), R the reach of a move, which loses nothing",
         unit="cells",
         ge=0,
     )
-    workers: int = option(
+    workers: int = count_option(
         "processes that plan or learn, or with a cluster of our own its cores; on one machine as many as it has cores",
         unit="processes",
-        ge=1,
         le=1024,
     )
     cluster: str | None = option(

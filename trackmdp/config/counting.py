@@ -5,7 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 from trackmdp.config.learning import EveryTaskConfig, check_classes
-from trackmdp.config.options import BYTES, Sizes, choice, option, refuse
+from trackmdp.config.options import (
+    BYTES,
+    Sizes,
+    choice,
+    count_option,
+    file_option,
+    option,
+    refuse,
+    share_option,
+)
 
 
 @choice("algo", "model_based", makes="trackmdp.algos.model_based:ModelBased")
@@ -31,26 +40,21 @@ class ModelBasedConfig(EveryTaskConfig):
         "null: chosen by a quarter of the paths, as is the use of exchange",
         ge=0,
     )
-    gamma: float = option(
-        "of plans on paths: discount inside the credit; policies are evaluated undiscounted",
-        ge=0,
-        le=1,
+    gamma: float = share_option(
+        "of plans on paths: discount inside the credit; policies are evaluated undiscounted"
     )
-    rounds: int = option(
+    rounds: int = count_option(
         "rounds of expectation-maximisation at each plan, six times as many at the end; of policy iteration on paths",
-        ge=1,
         le=10**6,
     )
-    plan_every: int | None = option(
+    plan_every: int | None = count_option(
         "batches from one plan to the next; the last batch has a plan in any case; null: each with chosen sets, else a "
-        "few plans in a run",
-        ge=1,
+        "few plans in a run"
     )
-    share_cells: str | None = option(
+    share_cells: str | None = file_option(
         "count moves of all cells, or of those of one class, together that are as far from each border; null: of all "
         "cells where the sensed moves show no difference",
-        expects="all, none, or a path to a .npy, .npz or .csv file of the class of each cell",
-        path=True,
+        "all, none, or a path to a .npy, .npz or .csv file of the class of each cell",
         words=("all", "none"),
     )
 

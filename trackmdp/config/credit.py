@@ -16,6 +16,8 @@ from trackmdp.config.options import (
     BYTES,
     Sizes,
     choice,
+    count_option,
+    file_option,
     nested,
     option,
     refuse,
@@ -48,18 +50,15 @@ class PerSensorConfig(EveryTaskConfig):
     ema_decay: float = option(
         "decay of the exponential moving average of the actor, which is evaluated", ge=0, lt=1
     )
-    batch_size: int = option(
+    batch_size: int = count_option(
         "path segments per update; a quarter as many where they are whole sensed paths",
         unit="segments",
-        ge=1,
     )
-    updates: int | None = option(
-        "updates of the whole run; null: by the size of the problem",
-        ge=1,
-        le=10**9,
+    updates: int | None = count_option(
+        "updates of the whole run; null: by the size of the problem", le=10**9
     )
-    updates_per_iteration: int = option(
-        "updates from one evaluation, log row or checkpoint to the next at most", ge=1
+    updates_per_iteration: int = count_option(
+        "updates from one evaluation, log row or checkpoint to the next at most"
     )
     hidden: int | None = option(
         "units of each net's hidden layer, 0 = plain tables without one; null: by the size of the problem, from 4,097 "
@@ -68,22 +67,20 @@ class PerSensorConfig(EveryTaskConfig):
         ge=0,
         le=4096,
     )
-    buffer_size: int = option("path segments kept for replay", unit="segments", ge=1)
-    share_cells: str = option(
+    buffer_size: int = count_option("path segments kept for replay", unit="segments")
+    share_cells: str = file_option(
         "assume that the target moves alike from all cells, or from those of one class, and learn one policy for all "
         "with the same surroundings; with one price for all sensors",
-        expects="all, none, or a path to a .npy, .npz or .csv file of the class of each cell",
-        path=True,
+        "all, none, or a path to a .npy, .npz or .csv file of the class of each cell",
         words=("all", "none"),
     )
     exchange: bool = option(
         "with collect=all_on: at the end, change learned sets jointly where it pays on other paths than those that "
         "propose it; whole ones, a quarter kept from learning, where the next move does not depend on the cell alone"
     )
-    max_entries: int = option(
+    max_entries: int = count_option(
         "entries (located cell, misses, sensor) of the losses' tables at once; larger ones are gone through in parts",
         unit="entries",
-        ge=1,
     )
 
     def check(self, key: str, root: Any) -> None:
@@ -144,8 +141,8 @@ class PpoPerSensorConfig(PolicyGradientConfig):
     """Hindsight with the clipped surrogate of PPO, per sensor."""
 
     clip_epsilon: float = option("how far a sensor's probability ratio may leave 1", gt=0, lt=1)
-    minibatches: int = option(
-        "parts of a batch: updates until the old policy of the ratio is renewed", ge=1
+    minibatches: int = count_option(
+        "parts of a batch: updates until the old policy of the ratio is renewed"
     )
     surrogate: str = option(
         "over both actions of every sensor, or over sets drawn from the old policy",

@@ -5,7 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from trackmdp.config.hidden_kernels import HiddenKernelConfig
-from trackmdp.config.options import choice, option
+from trackmdp.config.options import (
+    choice,
+    count_option,
+    option,
+)
 from trackmdp.config.sensors import SensorConfig
 from trackmdp.config.world import GridConfig
 
@@ -15,7 +19,7 @@ class GivenKernelConfig(HiddenKernelConfig):
     """The motion, or the recorded tracks, of the problem given to `trackmdp.train`; not for a command line."""
 
     motion: bool = option("whether there is a motion model; false: recorded tracks")
-    modes: int = option("hidden modes of the target", unit="modes", ge=1)
+    modes: int = count_option("hidden modes of the target", unit="modes")
     digest: str = option(
         "of the problem, so that runs of two problems stay apart",
         expects="no command line but trackmdp.train to set it",

@@ -11,10 +11,12 @@ from trackmdp.config.options import (
     TABLES,
     Option,
     choice,
+    file_option,
     option,
     options,
     refuse,
     require_able,
+    share_option,
 )
 from trackmdp.config.registry import choice_values, resolved
 from trackmdp.config.world import KernelConfig
@@ -47,14 +49,11 @@ class HiddenKernelConfig(KernelConfig):
 class HeadingConfig(HiddenKernelConfig):
     """A target with one of eight headings, hidden from the tracker; at the border it turns back."""
 
-    keep: float = option(
-        "probability of keeping the heading; else it turns by 45 degrees",
-        unit="per step",
-        ge=0,
-        le=1,
+    keep: float = share_option(
+        "probability of keeping the heading; else it turns by 45 degrees", unit="per step"
     )
-    go: float = option(
-        "probability of moving one cell that way; else it stays", unit="per step", ge=0, le=1
+    go: float = share_option(
+        "probability of moving one cell that way; else it stays", unit="per step"
     )
     exit_probability: float = option("probability of leaving the grid", unit="per step", gt=0, lt=1)
 
@@ -71,10 +70,9 @@ class RegimesConfig(HiddenKernelConfig):
         unit="per step",
         expects="a number from 0 to 1, or a list of one per regime",
     )
-    regimes: Any = option(
+    regimes: Any = file_option(
         "two or more kernels: {kernel: NAME, OPTION: VALUE, ...}, the rest as in conf/, or a table's file",
-        expects="a list, each {kernel: NAME, OPTION: VALUE, ...} or a path to a .npy, .npz or .csv file",
-        path=True,
+        "a list, each {kernel: NAME, OPTION: VALUE, ...} or a path to a .npy, .npz or .csv file",
     )
 
     def check(self, key: str, root: Any) -> None:
@@ -156,8 +154,8 @@ class CoordinatedTurnConfig(VelocityConfig):
     """As constant_velocity, but the target turns left, right or not at all; turn and velocity are the mode."""
 
     turn_rate: float = option("how fast it turns", unit="degrees/s", gt=0, le=180)
-    stay: float = option(
-        "probability of going on as it turns; else the other two are as likely", ge=0, le=1
+    stay: float = share_option(
+        "probability of going on as it turns; else the other two are as likely"
     )
 
 

@@ -13,9 +13,11 @@ from trackmdp.config.options import (
     NodeConfig,
     Sizes,
     choice,
+    count_option,
     nested,
     option,
     refuse,
+    share_option,
 )
 
 MOST_FRAMES = 10**12
@@ -35,9 +37,9 @@ class ScheduleConfig(NodeConfig):
 
     start: float = option("value at the start", ge=0, le=1e6)
     end: float = option("value at the end", ge=0, le=1e6)
-    begin: float = option("where the change begins", unit="fraction of the run", ge=0, le=1)
-    until: float = option(
-        "where the change ends, not before begin", unit="fraction of the run", ge=0, le=1
+    begin: float = share_option("where the change begins", unit="fraction of the run")
+    until: float = share_option(
+        "where the change ends, not before begin", unit="fraction of the run"
     )
 
     def check(self, key: str, root: Any) -> None:
@@ -75,9 +77,9 @@ class AlgoConfig(ChoiceConfig):
     """Whether no more sensors than the budget are on, also while learning."""
     joint: ClassVar[bool] = False
     """Whether it learns of several targets together; else of a single one, and plans are merged."""
-    total_frames: int = option("env steps the algorithm needs", unit="frames", ge=1, le=MOST_FRAMES)
-    frames_per_batch: int = option("env steps per collected batch", unit="frames", ge=1)
-    envs: int = option("environments stepped together", ge=1)
+    total_frames: int = count_option("env steps the algorithm needs", unit="frames", le=MOST_FRAMES)
+    frames_per_batch: int = count_option("env steps per collected batch", unit="frames")
+    envs: int = count_option("environments stepped together")
 
 
 class EveryTaskConfig(AlgoConfig):
@@ -93,12 +95,10 @@ class NetworkConfig(EveryTaskConfig):
 
     knows_budget: ClassVar[bool] = True
     joint: ClassVar[bool] = True
-    gamma: float = option(
-        "discount while learning; policies are evaluated undiscounted", ge=0, le=1
-    )
+    gamma: float = share_option("discount while learning; policies are evaluated undiscounted")
     learning_rate: ScheduleConfig = nested(LEARNING_RATE)
     max_grad_norm: float = option("gradients are clipped to this norm", gt=0)
-    hidden: int = option("units of the hidden layer of each network", unit="units", ge=1, le=4096)
+    hidden: int = count_option("units of the hidden layer of each network", unit="units", le=4096)
     reward_scale: float = option("factor on rewards while learning", gt=0)
 
     def needs(self, task: Sizes, root: Any) -> dict[str, int]:
@@ -117,7 +117,7 @@ class NetworkConfig(EveryTaskConfig):
 class ActorCriticConfig(NetworkConfig):
     """Common options of A2C and PPO."""
 
-    gae_lambda: float = option("λ of the generalised advantage estimate", ge=0, le=1)
+    gae_lambda: float = share_option("λ of the generalised advantage estimate")
     entropy: ScheduleConfig = nested(ENTROPY)
     critic_coef: float = option("weight of the value loss", ge=0)
     initial_logit: float = option("actor's output bias at the start", unit="logits", ge=-20, le=20)
@@ -133,8 +133,8 @@ class PpoConfig(ActorCriticConfig):
     """Proximal policy optimisation, one Bernoulli per sensor, one joint advantage."""
 
     clip_epsilon: float = option("how far the probability ratio may leave 1", gt=0, lt=1)
-    epochs: int = option("passes over each collected batch", ge=1, le=100)
-    minibatches: int = option("parts each batch is cut into", ge=1)
+    epochs: int = count_option("passes over each collected batch", le=100)
+    minibatches: int = count_option("parts each batch is cut into")
 
     def check(self, key: str, root: Any) -> None:
         """The parts of a batch are of one size."""
@@ -149,8 +149,8 @@ class PrioritizedConfig(NodeConfig):
     """Prioritised replay: transitions are drawn in proportion to |TD error|^alpha."""
 
     enabled: bool = option("prioritised instead of uniform replay")
-    alpha: float = option("how much priorities matter", ge=0, le=1)
-    beta: float = option("how much the draw is corrected for", ge=0, le=1)
+    alpha: float = share_option("how much priorities matter")
+    beta: float = share_option("how much the draw is corrected for")
 
     def ignored(self, root: Any) -> dict[str, str]:
         """Uniform replay has no priorities."""
@@ -169,10 +169,10 @@ class DqnConfig(NetworkConfig):
         "probability that a sensor of no use is on at random while collecting; one of use is off the more seldom, the "
         "more prices it is worth"
     )
-    n_step: int = option("rewards summed before bootstrapping", unit="steps", ge=1, le=64)
-    buffer_size: int = option("transitions kept for replay", unit="frames", ge=1)
-    batch_size: int = option("transitions per update", unit="frames", ge=1)
-    updates: int = option("updates per collected batch", ge=1, le=10**6)
+    n_step: int = count_option("rewards summed before bootstrapping", unit="steps", le=64)
+    buffer_size: int = count_option("transitions kept for replay", unit="frames")
+    batch_size: int = count_option("transitions per update", unit="frames")
+    updates: int = count_option("updates per collected batch", le=10**6)
     target_tau: float = option("share of the target network replaced at each update", gt=0, le=1)
     prioritized: PrioritizedConfig
 
@@ -202,13 +202,11 @@ class DqnConfig(NetworkConfig):
 class CollectorConfig(ChoiceConfig):
     """Base of the group `collector`: where the frames come from. One frame is one env step of one environment."""
 
-    total_frames: int = option("env steps of the whole run", unit="frames", ge=1, le=MOST_FRAMES)
-    frames_per_batch: int = option(
-        "env steps per collected batch, a multiple of the number of environments",
-        unit="frames",
-        ge=1,
+    total_frames: int = count_option("env steps of the whole run", unit="frames", le=MOST_FRAMES)
+    frames_per_batch: int = count_option(
+        "env steps per collected batch, a multiple of the number of environments", unit="frames"
     )
-    envs: int = option("environments stepped together, in each worker", ge=1)
+    envs: int = count_option("environments stepped together, in each worker")
     device: str = option(
         "device the environments live on", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE
     )
@@ -246,8 +244,8 @@ class SingleConfig(CollectorConfig):
 class WorkersConfig(CollectorConfig):
     """Common options of the collectors with worker processes."""
 
-    workers: int = option("worker processes", ge=1, le=256)
-    threads: int = option("torch threads of each worker process", unit="threads", ge=1, le=256)
+    workers: int = count_option("worker processes", le=256)
+    threads: int = count_option("torch threads of each worker process", unit="threads", le=256)
 
     @property
     def stepped(self) -> int:

@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from trackmdp.config.options import ChoiceConfig, choice, option
+from trackmdp.config.options import (
+    ChoiceConfig,
+    choice,
+    count_option,
+    option,
+)
 from trackmdp.errors import require
 
 
@@ -23,7 +28,7 @@ class LogConfig(ChoiceConfig):
 class RowsConfig(LogConfig):
     """A row for each iteration that is due."""
 
-    every: int = option("iterations from one row to the next", unit="iterations", ge=1)
+    every: int = count_option("iterations from one row to the next", unit="iterations")
 
 
 @choice("log", "csv", makes="trackmdp.training.loggers:CsvLogger")
@@ -65,13 +70,12 @@ class McapConfig(LogConfig):
     """`episodes.mcap`: simulated episodes, step by step, for `replay` and viewers."""
 
     episodes_only: ClassVar[bool] = True
-    evaluations: int = option(
+    evaluations: int = count_option(
         "training: from one recorded evaluation to the next; the last is recorded too",
         unit="evaluations",
-        ge=1,
     )
-    episodes: int = option(
-        "training: episodes recorded of each such evaluation", unit="episodes", ge=1, le=10**6
+    episodes: int = count_option(
+        "training: episodes recorded of each such evaluation", unit="episodes", le=10**6
     )
     layout: bool = option("write a viewer's layout next to the log")
 

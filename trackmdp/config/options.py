@@ -148,6 +148,21 @@ def option(help: str, **described: Any) -> Any:
     return dataclasses.field(metadata={"option": Option(help, **described)})
 
 
+def share_option(help: str, **described: Any) -> Any:
+    """An `option` of a number from 0 to 1."""
+    return option(help, ge=0, le=1, **described)
+
+
+def count_option(help: str, **described: Any) -> Any:
+    """An `option` of a number from 1 on."""
+    return option(help, ge=1, **described)
+
+
+def file_option(help: str, expects: str, **described: Any) -> Any:
+    """An `option` of a path, or of several."""
+    return option(help, expects=expects, path=True, **described)
+
+
 def nested(help: str) -> Any:
     """A dataclass field that is a config of its own, with a line for `--help` above its options."""
     return dataclasses.field(metadata={"nested": help})
@@ -185,7 +200,10 @@ class Sizes:
     markov: bool
 
 
-@dataclass_transform(kw_only_default=True, field_specifiers=(option, nested))
+@dataclass_transform(
+    kw_only_default=True,
+    field_specifiers=(option, share_option, count_option, file_option, nested),
+)
 class NodeConfig:
     """Base of every schema. Each subclass becomes a dataclass with keywords only, without a decorator.
 

@@ -9,7 +9,16 @@ from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.by_blocks import PartitionConfig, SweptPartitionConfig
 from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig
 from trackmdp.config.logs import LogConfig
-from trackmdp.config.options import GROUPS, NodeConfig, listed, option, refuse
+from trackmdp.config.options import (
+    GROUPS,
+    NodeConfig,
+    count_option,
+    file_option,
+    listed,
+    option,
+    refuse,
+    share_option,
+)
 from trackmdp.config.sensors import CostConfig, SensorConfig
 from trackmdp.config.several import MergedTargetsConfig, TargetsConfig, WidthConfig
 from trackmdp.config.world import GridConfig, KernelConfig, TaskConfig
@@ -46,14 +55,14 @@ class WorldConfig(CommandConfig):
 class EvaluationConfig(WidthConfig):
     """How often the policy is evaluated while it learns."""
 
-    every: int = option("iterations from one exact evaluation to the next", unit="iterations", ge=1)
+    every: int = count_option("iterations from one exact evaluation to the next", unit="iterations")
 
 
 class OptimalBoundConfig(NodeConfig):
     """The certified optimum beside the policy's figures."""
 
     enabled: bool = option("solve for the optimum at the end")
-    nodes: int = option("choices of branch and bound after which solving stops", unit="nodes", ge=1)
+    nodes: int = count_option("choices of branch and bound after which solving stops", unit="nodes")
     time_limit: float | None = option(
         "stop after this time even so; regrets then depend on the machine, and the output names it; null = never",
         unit="s",
@@ -74,7 +83,7 @@ class CheckpointConfig(NodeConfig):
         unit="s",
         gt=0,
     )
-    keep: int = option("newest checkpoints kept", ge=1)
+    keep: int = count_option("newest checkpoints kept")
 
 
 class TrainConfig(WorldConfig):
@@ -86,7 +95,7 @@ class TrainConfig(WorldConfig):
     device: str = option(
         "device the networks live on", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE
     )
-    threads: int = option("torch threads of the learning process", unit="threads", ge=1, le=256)
+    threads: int = count_option("torch threads of the learning process", unit="threads", le=256)
     task: TaskConfig
     algo: AlgoConfig
     collector: CollectorConfig
@@ -96,16 +105,13 @@ class TrainConfig(WorldConfig):
     evaluation: EvaluationConfig
     optimal: OptimalBoundConfig
     checkpoint: CheckpointConfig
-    resume: str | None = option(
+    resume: str | None = file_option(
         "go on with a run: auto = the one in hydra.run.dir, where there is one",
-        expects="auto, a run's folder, a checkpoint",
-        path=True,
+        "auto, a run's folder, a checkpoint",
         words=("auto",),
     )
-    init_from: str | None = option(
-        "start from the weights of another run, where shapes fit",
-        expects="the folder of a run",
-        path=True,
+    init_from: str | None = file_option(
+        "start from the weights of another run, where shapes fit", "the folder of a run"
     )
 
     def check(self, key: str, root: Any) -> None:
@@ -123,10 +129,8 @@ class EvaluateConfig(WorldConfig):
 
     needs_motion: ClassVar[bool] = False
     task: TaskConfig
-    run: str | None = option(
-        "folder of a training run; its world is taken from there",
-        expects="the folder of a run",
-        path=True,
+    run: str | None = file_option(
+        "folder of a training run; its world is taken from there", "the folder of a run"
     )
     baseline: BaselineConfig | None
     targets: MergedTargetsConfig
@@ -136,7 +140,7 @@ class EvaluateConfig(WorldConfig):
     device: str = option(
         "device of the simulation", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE
     )
-    threads: int = option("torch threads", unit="threads", ge=1, le=256)
+    threads: int = count_option("torch threads", unit="threads", le=256)
     episodes: int = option("episodes simulated; 0 = exact figures only", unit="episodes", ge=0)
 
     def check(self, key: str, root: Any) -> None:
@@ -164,10 +168,8 @@ class CompareConfig(WorldConfig):
 
     needs_motion: ClassVar[bool] = False
     task: TaskConfig
-    runs: list[str] | None = option(
-        "folders of training runs; run=A run=B is the same as runs=[A,B]",
-        expects="the folder of a run",
-        path=True,
+    runs: list[str] | None = file_option(
+        "folders of training runs; run=A run=B is the same as runs=[A,B]", "the folder of a run"
     )
     baselines: list[str] | None = option(
         "policies that are not learned; baseline=A baseline=B is the same as baselines=[A,B]",
@@ -201,8 +203,8 @@ class FrontierConfig(WorldConfig):
     any_number: ClassVar[bool] = True
     task: TaskConfig
     solver: BaselineConfig
-    accuracy: float | None = option(
-        "show the mixture of policies of the frontier that has this accuracy", ge=0, le=1
+    accuracy: float | None = share_option(
+        "show the mixture of policies of the frontier that has this accuracy"
     )
     sensors: float | None = option(
         "show the best policies with so many sensors", unit="sensors per step", ge=0
@@ -236,7 +238,7 @@ class VerifyConfig(WorldConfig):
 class ReplayConfig(CommandConfig):
     """Look at logged episodes, prove them, rebuild a damaged log; with file= alone, list the episodes."""
 
-    file: str = option("the log", expects="a file written with log=[mcap]", path=True)
+    file: str = file_option("the log", "a file written with log=[mcap]")
     episode: int | None = option(
         "play this episode; for html= and csv= the one that is written", ge=0
     )
@@ -244,25 +246,19 @@ class ReplayConfig(CommandConfig):
     recover: bool = option(
         "write every whole episode of a cut or damaged log to a new one beside it"
     )
-    html: str | None = option(
-        "write one episode (by default the first) as a web page",
-        expects="a file to write",
-        path=True,
+    html: str | None = file_option(
+        "write one episode (by default the first) as a web page", "a file to write"
     )
-    csv: str | None = option("write steps.csv and episodes.csv", expects="a folder", path=True)
-    layout: str | None = option(
-        "write the layout for viewers", expects="a file to write", path=True
-    )
+    csv: str | None = file_option("write steps.csv and episodes.csv", "a folder")
+    layout: str | None = file_option("write the layout for viewers", "a file to write")
     speed: float = option("speed of playing", unit="steps/s", gt=0, le=1000)
 
 
 class ReportConfig(CommandConfig):
     """Make figures, tables and one web page of a sweep, or watch it run."""
 
-    sweep: str = option(
-        "folder of the sweep, or of stored results",
-        expects="the folder of a sweep or an earlier report",
-        path=True,
+    sweep: str = file_option(
+        "folder of the sweep, or of stored results", "the folder of a sweep or an earlier report"
     )
     watch: bool = option("show all runs live until they are done, instead of a report")
     paper: bool | None = option(
@@ -279,7 +275,7 @@ class ReportConfig(CommandConfig):
 class ExportConfig(CommandConfig):
     """Write a learned policy as a file that runs without this package."""
 
-    run: str = option("folder of a training run", expects="the folder of a run", path=True)
+    run: str = file_option("folder of a training run", "the folder of a run")
     format: str = option(
         "onnx: policy.onnx, pt2: policy.pt2 for torch.export, sets: sets.json, geojson: cells on a map with value and "
         "sensors",

@@ -10,6 +10,8 @@ from trackmdp.config.options import (
     ChoiceConfig,
     Option,
     choice,
+    count_option,
+    file_option,
     listed,
     option,
     refuse,
@@ -36,12 +38,11 @@ class PaperCostConfig(CostConfig):
     reward: float = option(
         "r, earned by a detection", unit="reward", ge=1 / LARGEST_PRICE, le=LARGEST_PRICE
     )
-    sensor: Any = option(
+    sensor: Any = file_option(
         "c, price of one sensor switched on for one step, for all sensors or for each",
-        unit="reward per sensor-step",
-        expects="a number from 0 to 1e15, or one per sensor: a list (null = no sensor), or a path to a .npy, .npz or "
+        "a number from 0 to 1e15, or one per sensor: a list (null = no sensor), or a path to a .npy, .npz or "
         ".csv file (nan = no sensor)",
-        path=True,
+        unit="reward per sensor-step",
     )
     safe: float | None = option(
         "D, price of the safe action; null = the sum of all sensors' prices",
@@ -144,7 +145,7 @@ class PerfectSensorConfig(SensorConfig):
 def _chance(help: str) -> Any:
     """An option of a probability above 0, for all cells or for each."""
     expects = "a number above 0, at most 1, or one per cell: a list, or a path to a .npy, .npz or .csv file"
-    return option(help, expects=expects, path=True)
+    return file_option(help, expects)
 
 
 @choice("sensor", "miss", makes="trackmdp.world.make:miss")
@@ -202,14 +203,13 @@ class FootprintConfig(MissConfig):
         unit="cells",
         ge=0,
     )
-    spacing: int = option(
-        "rows and columns from one sensor to the next, on a lattice", unit="cells", ge=1
+    spacing: int = count_option(
+        "rows and columns from one sensor to the next, on a lattice", unit="cells"
     )
-    path: str | None = option(
+    path: str | None = file_option(
         "file in place of the lattice: a row per sensor, 1 in the column of each cell that it covers, or the "
         "probability of a report there, a factor on p_d",
-        expects="a path to a .npz (scipy.sparse.save_npz or an array), .npy or .csv file",
-        path=True,
+        "a path to a .npz (scipy.sparse.save_npz or an array), .npy or .csv file",
     )
 
     def count(self, grid: GridConfig) -> int | None:

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from trackmdp.config.options import NodeConfig, option, refuse
+from trackmdp.config.options import (
+    NodeConfig,
+    count_option,
+    option,
+    refuse,
+)
 
 MOST_TARGETS = 1_000
 """Targets in one grid: of more, each step and each bound would take minutes."""
@@ -13,10 +18,9 @@ MOST_TARGETS = 1_000
 class TargetsConfig(NodeConfig):
     """Targets that are in the grid at the same time: labelled, independent, alike in their motion."""
 
-    count: int = option(
+    count: int = count_option(
         "K; they share the sensors, which are paid once while any of them is in the grid",
         unit="targets",
-        ge=1,
         le=MOST_TARGETS,
     )
 

@@ -5,7 +5,12 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from trackmdp.cluster import ADDRESS, joining
-from trackmdp.config.options import ChoiceConfig, choice, option
+from trackmdp.config.options import (
+    ChoiceConfig,
+    choice,
+    count_option,
+    option,
+)
 from trackmdp.errors import UserError, require
 
 PLUGINS = ("launcher", "sweeper")
@@ -48,8 +53,8 @@ class OptunaConfig(SweeperConfig):
     """A search over the words with several values, `range(a,b)` or `interval(a,b)`."""
 
     package = extra = "optuna"
-    n_trials: int = option(
-        "runs of the whole study, those of earlier calls among them", unit="runs", ge=1
+    n_trials: int = count_option(
+        "runs of the whole study, those of earlier calls among them", unit="runs"
     )
     objective: str = option(
         "the largest AIHTR, or the least regret to the bound that each run proves in optimal.nodes; both are computed "
@@ -58,7 +63,7 @@ class OptunaConfig(SweeperConfig):
     )
     sampler: str = option("how the next run is chosen", choices=("tpe", "random"))
     seed: int = option("every choice derives from it", ge=0)
-    batch: int = option("runs chosen at once, for launchers that run several", unit="runs", ge=1)
+    batch: int = count_option("runs chosen at once, for launchers that run several", unit="runs")
     study: str = option("name of the study in its storage", expects="a name")
     storage: str | None = option(
         "database of the study; null = study.db in the sweep's folder",
@@ -88,8 +93,8 @@ class JoblibConfig(LauncherConfig):
 
     package, extra = "joblib", "sweep"
 
-    n_jobs: int | None = option(
-        "runs at once; null = one for each core", unit="runs", ge=1, le=1024
+    n_jobs: int | None = count_option(
+        "runs at once; null = one for each core", unit="runs", le=1024
     )
 
 
@@ -98,18 +103,18 @@ class SubmititConfig(LauncherConfig):
 
     package, extra = "submitit", "slurm"
 
-    timeout_min: int = option(
-        "a run is stopped after this long, and resumes where requeued", unit="min", ge=1
+    timeout_min: int = count_option(
+        "a run is stopped after this long, and resumes where requeued", unit="min"
     )
-    cpus_per_task: int = option("cores of a run", unit="cores", ge=1)
+    cpus_per_task: int = count_option("cores of a run", unit="cores")
 
 
 @choice("hydra/launcher", "submitit_local", makes="trackmdp.app.sweep.launchers:run_here")
 class SubmititLocalConfig(SubmititConfig):
     """As submitit_slurm, but on this machine: to try out a cluster."""
 
-    n_jobs: int | None = option(
-        "runs at once; null = as many as there are cores for", unit="runs", ge=1, le=1024
+    n_jobs: int | None = count_option(
+        "runs at once; null = as many as there are cores for", unit="runs", le=1024
     )
 
 
@@ -119,9 +124,9 @@ class SubmititSlurmConfig(SubmititConfig):
 
     mem_gb: float | None = option("memory of a run; null = the cluster's default", unit="GB", gt=0)
     gpus_per_node: int | None = option("GPUs of a run; null = none asked for", unit="GPUs", ge=0)
-    array_parallelism: int = option("runs at once", unit="runs", ge=1)
+    array_parallelism: int = count_option("runs at once", unit="runs")
     max_num_timeout: int = option("times that a run that is out of time is requeued", ge=0)
-    signal_delay_s: int = option("a run saves this long before its time is out", unit="s", ge=1)
+    signal_delay_s: int = count_option("a run saves this long before its time is out", unit="s")
     partition: str | None = option("partition; null = the cluster's default", expects="its name")
     account: str | None = option("account; null = the user's default", expects="its name")
     setup: list[str] | None = option(
@@ -154,7 +159,7 @@ class RayConfig(LauncherConfig):
     address: str | None = option(
         "cluster to join; null = start one here", expects="auto, or host:port", pattern=ADDRESS
     )
-    num_cpus: int | None = option("cores of a cluster started here; null = all", unit="cores", ge=1)
+    num_cpus: int | None = count_option("cores of a cluster started here; null = all", unit="cores")
     cpus_per_run: float = option("cores of a run", unit="cores", gt=0)
     gpus_per_run: float = option("GPUs of a run", unit="GPUs", ge=0)
 

@@ -9,9 +9,12 @@ from trackmdp.config.options import (
     NodeConfig,
     Sizes,
     choice,
+    count_option,
+    file_option,
     option,
     refuse,
     require_able,
+    share_option,
 )
 from trackmdp.errors import UserError
 
@@ -38,10 +41,9 @@ class GridConfig(NodeConfig):
     t_max: int = option(
         "T_max: free choices at n = 0 ... t_max, then the safe action", unit="steps", ge=0, le=16
     )
-    max_steps: int | None = option(
+    max_steps: int | None = count_option(
         "truncate an episode after so many steps; null = only the exit ends it",
         unit="steps",
-        ge=1,
         le=1_000_000,
     )
     window: int | None = option(
@@ -100,10 +102,9 @@ class TaskConfig(NodeConfig):
         "or without the misses between; or the last displacement and the direction of the one before",
         choices=MEMORIES,
     )
-    clip: int = option(
+    clip: int = count_option(
         "rows and columns up to which displacements differ; larger ones count as that",
         unit="cells",
-        ge=1,
         le=8,
     )
 
@@ -151,10 +152,10 @@ class ExitingConfig(KernelConfig):
 class RandomSupportConfig(ExitingConfig):
     """The paper's motion: Z random positions around each cell, one of low probability, the others equal."""
 
-    support_size: int = option(
-        "Z, positions the target may move to, at most (2·radius+1)²", unit="cells", ge=1
+    support_size: int = count_option(
+        "Z, positions the target may move to, at most (2·radius+1)²", unit="cells"
     )
-    radius: int = option("reach of a move", unit="cells", ge=1, le=8)
+    radius: int = count_option("reach of a move", unit="cells", le=8)
     low_probability: float = option(
         "probability of the one unlikely position", unit="per step", gt=0, lt=1
     )
@@ -177,7 +178,7 @@ class RandomSupportConfig(ExitingConfig):
 class RandomWalkConfig(ExitingConfig):
     """A lazy random walk on the 4 or 8 neighbours."""
 
-    stay: float = option("probability of staying in the cell", unit="per step", ge=0, le=1)
+    stay: float = share_option("probability of staying in the cell", unit="per step")
     diagonal: bool = option("whether the 4 diagonal neighbours are reached as well")
 
 
@@ -186,18 +187,14 @@ class DriftConfig(ExitingConfig):
     """A target that heads one way most of the time."""
 
     direction: float = option("heading, 0 = right, 90 = up", unit="degrees", ge=0, lt=360)
-    persistence: float = option(
-        "probability of keeping to the heading", unit="per step", ge=0, le=1
-    )
+    persistence: float = share_option("probability of keeping to the heading", unit="per step")
 
 
 @choice("kernel", "table", makes="trackmdp.world.kernels:load_table")
 class TableConfig(KernelConfig):
     """A table of your own: row i holds the probabilities of moving from cell i to each cell."""
 
-    path: str = option(
-        "file with the M x M table", expects="a path to a .npy, .npz or .csv file", path=True
-    )
+    path: str = file_option("file with the M x M table", "a path to a .npy, .npz or .csv file")
 
     @property
     def source(self) -> str:
@@ -210,10 +207,9 @@ class TracksConfig(KernelConfig):
     """No motion model but recorded tracks: learn from most of them, choose by some, and judge on those held out."""
 
     is_motion: ClassVar[bool] = False
-    path: str = option(
+    path: str = file_option(
         "file of cells (columns track, cell, or row and column, and, if wanted, step), or of positions",
-        expects="a path to a .csv, .npz, .parquet, .geojson, .gpx, .txt (MOT-Challenge) or .xml (SUMO) file",
-        path=True,
+        "a path to a .csv, .npz, .parquet, .geojson, .gpx, .txt (MOT-Challenge) or .xml (SUMO) file",
     )
     format: str | None = option(
         "content of the file; null = by its ending and columns. points = a table of id, time and x, y or lat, lon, "
@@ -251,10 +247,8 @@ class TracksConfig(KernelConfig):
         lt=1,
     )
     seed: int = option("seed of the draw of these two", ge=0)
-    min_length: int | None = option(
-        "fewest cells of a track; null = grid.t_max + 3, a whole path of a policy",
-        unit="cells",
-        ge=1,
+    min_length: int | None = count_option(
+        "fewest cells of a track; null = grid.t_max + 3, a whole path of a policy", unit="cells"
     )
     markov: bool = option(
         "take the next move to depend on the cell alone, so that moves of different tracks combine"

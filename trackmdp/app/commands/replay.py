@@ -16,7 +16,6 @@ from trackmdp.episodes.recover import recover
 from trackmdp.episodes.schema import versions_apart
 from trackmdp.errors import RunError, UserError
 from trackmdp.training.display import make_console, table
-from trackmdp.untrusted import reason
 from trackmdp.world.group import Group
 
 
@@ -66,7 +65,9 @@ def _exports(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> bool
         try:
             write(Path(path))
         except OSError as error:
-            raise UserError(f"{key}={path}: cannot be written ({reason(error)})") from error
+            raise UserError(
+                f"{key}={path}: cannot be written ({(error.strerror or str(error)).lower()})"
+            ) from error
         console.print(f"{key} -> {path}")
     return any(path is not None for _, path, _ in writers)
 
