@@ -15,7 +15,8 @@ from trackmdp.algos.dqn import DQN
 from trackmdp.app.cli import main
 from trackmdp.config import DqnConfig
 from trackmdp.errors import UserError
-from trackmdp.training.devices import available_bytes, check_memory, needs
+from trackmdp.machine import free_bytes
+from trackmdp.training.devices import check_memory, needs
 from trackmdp.world.group import Group
 
 CPU = torch.device("cpu")
@@ -161,8 +162,8 @@ def test_a_run_says_what_it_takes(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_the_job_may_have_less_than_the_machine(
     tmp_path: Path, cgroup: dict[str, str], kib: int
 ) -> None:
-    assert available_bytes(CPU, system(tmp_path, 8000, **cgroup)) == kib * 1024
+    assert free_bytes(system(tmp_path, 8000, **cgroup)) == kib * 1024
 
 
 def test_a_system_that_does_not_say_counts_as_unlimited(tmp_path: Path) -> None:
-    assert available_bytes(CPU, tmp_path) == 2**63
+    assert free_bytes(tmp_path) == 2**63

@@ -72,20 +72,12 @@ def _dispatch(words: list[str]) -> int:
             raise UserError(
                 "Windows is not supported: expected Linux or macOS, or Linux in WSL on Windows"
             )
-        _check_current_folder()
         return _run(command, words[1:])
     except BrokenPipeError:
         raise
     # Named one by one: SystemExit passes, with which argparse ends after `--version`.
     except (Exception, KeyboardInterrupt, Preempted) as error:
         return _report(command, error)
-
-
-def _check_current_folder() -> None:
-    try:
-        Path.cwd()
-    except FileNotFoundError:
-        raise UserError("the current folder was removed, expected one that exists") from None
 
 
 def _report(command: str, error: BaseException) -> int:
@@ -115,6 +107,10 @@ def _report(command: str, error: BaseException) -> int:
 
 
 def _run(command: str, words: list[str]) -> int:
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        raise UserError("the current folder was removed, expected one that exists") from None
     if "-h" in words or "--help" in words:
         from trackmdp.app.manual import manual
 

@@ -72,20 +72,16 @@ def _run_once(compose: Composer) -> int:
         cfg.hydra.run.dir = str(ready.folder)  # a run that is resumed writes to its own
     try:
         announce(compose.command, ready.cfg, ready.folder)
-        if (grids := _grids(cfg)) and not ready.cfg.quiet:
+        grids = OmegaConf.select(cfg, "hydra.sweeper.blocks")  # a single run does not read them
+        if grids and not ready.cfg.quiet:
             say(
-                f"one run with the defaults: -m is missing, which runs all {grids} grids of this config"
+                f"one run with the defaults: -m is missing, which runs all {len(grids)} grids of this config"
             )
         _run_in_hydra(cfg, ready)
     finally:
         # A run that failed before its first file leaves nothing; one that wrote something keeps it.
         remove_if_empty(made)
     return 0
-
-
-def _grids(cfg: DictConfig) -> int:
-    """How many grids of runs the config gives its sweeper, which a single run does not read."""
-    return len(OmegaConf.select(cfg, "hydra.sweeper.blocks") or [])
 
 
 def _run_in_hydra(cfg: DictConfig, ready: Prepared) -> None:
@@ -119,7 +115,7 @@ def _sweep(compose: Composer) -> int:
     from trackmdp.training.display import make_console
 
     command, words = compose.command, run_words(compose.words)
-    cfg = _of_all_runs(compose, words)
+    cfg = _of_all_runs(compose)
     # Now, so that a missing package is reported before anything is planned or written.
     sweeper, launcher = (
         _plugin("sweeper", cfg.hydra.sweeper),
@@ -150,16 +146,24 @@ def _sweep(compose: Composer) -> int:
         remove_if_empty(made)
 
 
-def _of_all_runs(compose: Composer, words: Sequence[str]) -> Any:
-    """The config of the words that all runs have in common."""
-    for word in words:
-        parsed(word)  # here the message names the word, later `hydra.sweep.dir`
+def _of_all_runs(compose: Composer) -> Any:
+    """The config of the words that all runs have in common.
+
+    Raises:
+        UserError: a word cannot be read, or has no effect on a sweep; or it gives several values to a setting of
+            Hydra's own, of which a sweep has one.
+    """
+    common = []
     for word in compose.words:
         if word.startswith("hydra.sweep.subdir="):
             raise UserError(f"{word}: without effect, a run's folder has the name of its options")
+        if not parsed(word).is_sweep_override():
+            common.append(word)
+        elif not run_words([word]):
+            raise UserError(f"{word}: expected one {word.partition('=')[0].split('/')[-1]}")
     # Hydra refuses words with several values outside its own multirun; options of the sweep as a whole have one
     # value.
-    return compose([word for word in compose.words if not _has_values(word)])
+    return compose(common)
 
 
 def _plugin(part: str, node: DictConfig) -> Any:
@@ -176,21 +180,6 @@ def _plugin(part: str, node: DictConfig) -> Any:
     typed = build_config(plain, schema, f"hydra.{part}.")
     validate(typed, f"hydra.{part}")
     return typed
-
-
-def _has_values(word: str) -> bool:
-    """Whether a word gives an option several values, as ``seed=0,1`` does.
-
-    Raises:
-        UserError: it asks for several values of Hydra's own settings, of which a sweep has one.
-    """
-    try:
-        several = parsed(word).is_sweep_override()
-    except UserError:  # composing reports the mistake
-        return False
-    if several and not run_words([word]):
-        raise UserError(f"{word}: expected one {word.partition('=')[0].split('/')[-1]}")
-    return several
 
 
 def parse(words: Sequence[str]) -> argparse.Namespace:

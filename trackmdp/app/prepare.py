@@ -148,11 +148,7 @@ def announce(command: str, cfg: CommandConfig, folder: Path, label: str = "") ->
 
 def shown(folder: Path) -> Path:
     """The folder as seen from the current one, where it lies in it."""
-    return (
-        folder.relative_to(Path.cwd())
-        if folder.is_absolute() and folder.is_relative_to(Path.cwd())
-        else folder
-    )
+    return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
 
 
 def say(line: str) -> None:

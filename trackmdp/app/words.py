@@ -107,8 +107,11 @@ def _refuse_wrong(error: Exception, command: str, words: Sequence[str], compose:
         key, value = override.key_or_group, override.value()
         if override.is_add() and isinstance(value, str) and "Multiple values" in str(error):
             raise UserError(f"{override.input_line}: in the config already, expected {key}={value}")
-    files = [override for override in overrides if _is_file(override, command)]
-    groups = [override for override in overrides if _is_choice(override, command)]
+    # An experiment, a launcher or a sweeper: exactly one, by the name of a file.
+    named = ("hydra/", "experiment") if command == "train" else "hydra/"
+    files = [override for override in overrides if override.key_or_group.startswith(named)]
+    of_command = GROUPS.keys() & options(ROOTS[command])
+    groups = [override for override in overrides if override.key_or_group in of_command]
     # Choices before values: with algo=pppo every algo.* would be unknown, though only the choice is wrong.
     for override in files:
         _check_file(override, str(error))
@@ -127,18 +130,6 @@ def _refuse_wrong(error: Exception, command: str, words: Sequence[str], compose:
         for override in overrides:
             if override not in [*files, *groups]:
                 _check_value(override, known)
-
-
-def _is_choice(override: Override, command: str) -> bool:
-    """Whether a word chooses from one of the command's groups."""
-    key = override.key_or_group
-    return key in GROUPS and key in options(ROOTS[command])
-
-
-def _is_file(override: Override, command: str) -> bool:
-    """Whether a word chooses an experiment, a launcher or a sweeper: exactly one, by the name of a file."""
-    key = override.key_or_group
-    return key.startswith("hydra/") or (key == "experiment" and command == "train")
 
 
 def _check_choice(override: Override, message: str) -> None:

@@ -28,15 +28,15 @@ CHANGEABLE = (
 """Options, or groups of them, that may differ on resume: budget, solving, logging, saving, workers and devices."""
 
 
-def run_folder(cfg: TrainConfig, chosen: Path) -> Path:
-    """The folder of the run: of the one that it resumes, else `chosen`.
+def run_folder(cfg: TrainConfig, chosen: Path, key: str = "hydra.run.dir") -> Path:
+    """The folder of the run: of the one that it resumes, else `chosen`, which the option `key` names.
 
     Raises:
         UserError: `resume` names no run, or `chosen` holds a run and `resume` is null.
     """
     if cfg.resume is None and (chosen / "config.yaml").is_file():
         raise UserError(
-            f"hydra.run.dir={chosen}: holds a run already; resume it by resume=auto, or choose another folder"
+            f"{key}={chosen}: holds a run already; resume it by resume=auto, or choose another folder"
         )
     if cfg.resume in (None, "auto"):
         return chosen

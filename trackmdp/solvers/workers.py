@@ -159,14 +159,19 @@ def _done(work: Callable[[Piece], Result], job: Piece) -> Result:
         raise
 
 
-def end_with_parent() -> None:
-    """End this process with the one that spawned it, which cannot end it when it is killed."""
+def end_with_parent(end: Callable[[], object] = lambda: os._exit(1)) -> None:
+    """End this process with the one that spawned it, which cannot end it when it is killed.
+
+    Args:
+        end: ends the process, by default at once (sys.exit would end the waiting thread alone).
+    """
 
     def wait() -> None:
         parent = multiprocessing.parent_process()
         if parent is not None:
+            # Returns when the parent's sentinel closes, which the system does however it ends.
             parent.join()
-            os._exit(1)  # not sys.exit, which would end this thread alone
+            end()
 
     threading.Thread(target=wait, daemon=True).start()
 

@@ -44,7 +44,8 @@ def check_memory(cfg: TrainConfig, task: Task, device: torch.device) -> str:
     Raises:
         UserError: it cannot fit; the option that takes most of it is named.
     """
-    parts, free = needs(cfg, task), available_bytes(device)
+    parts, gpu = needs(cfg, task), device.type == "cuda"
+    free = torch.cuda.mem_get_info(device)[0] if gpu else free_bytes()
     total = sum(parts.values())
     key = max(parts, key=lambda name: parts[name])
     if total > free:
@@ -60,11 +61,6 @@ def needs(cfg: TrainConfig, task: Task) -> dict[str, int]:
     for _, node in nodes(cfg):
         parts |= node.needs(sizes, cfg)
     return parts
-
-
-def available_bytes(device: torch.device, root: Path = Path("/")) -> int:
-    """Bytes that can still be had on `device`; `root` is where the system's files are (`machine.free_bytes`)."""
-    return int(torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else free_bytes(root)
 
 
 def machine() -> dict[str, Any]:

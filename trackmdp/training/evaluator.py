@@ -105,6 +105,8 @@ class ExactEvaluator(Evaluator):
         world: the task and the motion. The paper's bound knows no `max_steps` and is None where the world has one.
     """
 
+    qmdp: Evaluation
+
     def __init__(self, world: World) -> None:
         super().__init__(world)
         if world.max_steps is None:

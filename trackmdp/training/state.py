@@ -107,11 +107,9 @@ def take_weights(algorithm: Algorithm, run: Path, device: torch.device) -> list[
     """
     file = checkpoint.newest(run)
     state = checkpoint.load(file, device)
-    with decoded(str(file), "the state of a run"):
-        given = dict(_weights(state["algorithm"]))
-    own = algorithm.state_dict()
-    taken = []
+    own, taken = algorithm.state_dict(), []
     with torch.no_grad(), decoded(str(file), "the weights of a run"):
+        given = dict(_weights(state["algorithm"]))
         for name, tensor in _weights(own):
             if name in given and given[name].shape == tensor.shape:
                 # Into the tensors of our own state, which is then loaded as a whole: state_dict may have handed out

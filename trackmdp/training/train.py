@@ -17,6 +17,7 @@ from tensordict.nn import (
 from trackmdp.config import GROUPS, TrainConfig, options
 from trackmdp.config.compose import compose, default, given
 from trackmdp.config.logs import require_packages
+from trackmdp.config.resume import run_folder
 from trackmdp.errors import UserError
 from trackmdp.seeding import preserved_global_rng
 from trackmdp.training.blocks import make_trainer
@@ -99,17 +100,15 @@ def _prepare(config: TrainConfig, folder: Path) -> None:
     """Make the folder of a run.
 
     Raises:
-        UserError: it cannot be made, or holds a run that is not to be resumed; or a log's package is missing.
+        UserError: it cannot be made, or holds a run that is not to be resumed; `resume` names no run; or a log's
+            package is missing.
     """
     require_packages(config.log)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"folder={folder}: cannot be made ({reason(error)})") from None
-    if config.resume is None and (folder / "config.yaml").is_file():
-        raise UserError(
-            f"folder={folder}: holds a run already; resume it by resume='auto', or choose another one"
-        )
+    run_folder(config, folder, "folder")
 
 
 def _config(

@@ -324,7 +324,7 @@ def test_playback_needs_a_grid_of_its_size(
 ) -> None:
     words = ["evaluate", "baseline=playback", f"baseline.file={log}", "grid.size=5", "quiet=true"]
     assert main([*words, f"hydra.run.dir={tmp_path / 'a'}"]) == 2
-    assert "recorded on a grid of size 4, expected grid.size=5" in capsys.readouterr().err
+    assert "recorded on 4 x 4 cells, expected grid.size of 5 x 5 cells" in capsys.readouterr().err
 
 
 def test_a_full_disk_stops_the_log_and_is_said_once(

@@ -29,6 +29,7 @@ from trackmdp.episodes.player import draw_picture
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.simulate import resimulate, simulate
 from trackmdp.errors import UserError
+from trackmdp.notebook.card import grid_words
 from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import sets_name, write_sets
@@ -42,11 +43,10 @@ from trackmdp.solvers.group_value import evaluate_group
 from trackmdp.solvers.solve import baseline_policy
 from trackmdp.training.devices import make_device
 from trackmdp.training.display import make_console, show_held_out, table, with_interval
-from trackmdp.training.evaluator import CELL_ALONE, HeldOutEvaluator, make_evaluator
+from trackmdp.training.evaluator import CELL_ALONE, ExactEvaluator, HeldOutEvaluator
 from trackmdp.training.folders import SUMMARY, check_files, read_summary
 from trackmdp.training.group_run import FIGURES
 from trackmdp.training.run import trained
-from trackmdp.untrusted import decoded
 from trackmdp.world.gridding import said
 from trackmdp.world.group import Group, Subject, group_of, one_target
 from trackmdp.world.make import false_alarm
@@ -72,11 +72,8 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem) -> float:
     console = make_console(cfg.quiet)
     torch.set_num_threads(cfg.threads)
     device = make_device(cfg.device)
-    if (
-        cfg.run is None
-        and isinstance(cfg.baseline, PlaybackConfig)
-        and not isinstance(cfg.sensor, FalseAlarmConfig)
-    ):
+    believed = isinstance(cfg.sensor, FalseAlarmConfig)
+    if isinstance(cfg.baseline, PlaybackConfig) and not believed:
         return _played_back(cfg, cfg.baseline, problem, folder, console)
     world: Subject
     if cfg.run:
@@ -88,7 +85,7 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem) -> float:
     if count > 1:
         return _several(cfg, group_of(world, count), policy, subject, folder, console)
     world = one_target(world, f"run={cfg.run}")
-    if isinstance(cfg.sensor, FalseAlarmConfig):
+    if believed:
         return _believing(cfg, world, policy, subject, folder, console)
     # Recorded tracks have no kernel, hence no exact value and no bound: figures come from the held-out tracks.
     if isinstance(world, Recorded):
@@ -105,7 +102,7 @@ def _exact(
     console: Console,
 ) -> float:
     """Evaluate with the motion model."""
-    evaluator = make_evaluator(world)
+    evaluator = ExactEvaluator(world)
     # The run's own summary has measured against its own proof; the same world gets the same regret here.
     proved = _proved(cfg.run) if cfg.run else None
     score = evaluator.score(policy)
@@ -117,7 +114,7 @@ def _exact(
         "policy": subject,
         "exact": figures(score.evaluation),
         "simulated": asdict(simulation) if simulation else None,
-        "qmdp": figures(evaluator.qmdp) if evaluator.qmdp else None,
+        "qmdp": figures(evaluator.qmdp),
         "bounds": evaluator.bounds,
         "regret_per_step": score.regret_per_step,
         "regret_per_step_lower": score.regret_per_step_lower,
@@ -195,11 +192,8 @@ def _played_back(
     """
     with EpisodeReader(chosen.file) as reader:
         if reader.run.size != world.size:
-            recorded, expected = (
-                str(r) if r == c else f"[{r},{c}]" for r, c in (reader.run.size, world.size)
-            )
-            recorded = f"baseline.file={chosen.file}: recorded on a grid of size {recorded}"
-            raise UserError(f"{recorded}, expected grid.size={expected}")
+            recorded = f"baseline.file={chosen.file}: recorded on {grid_words(reader.run.size)}"
+            raise UserError(f"{recorded}, expected grid.size of {grid_words(world.size)}")
         logged = reader.read(chosen.episode)
     actions = Playback(world, logged.action)
     # The logged episode's own seed gives its own target again, so that both returns agree where nothing has changed
@@ -286,10 +280,8 @@ def _proved(run: str) -> dict[str, Any] | None:
     summary = read_summary(folder)
     # `trained` has compared the kernel with the config; the bracket is of the world that these describe.
     check_files(folder, summary, "config.yaml")
-    if summary.get("optimal") is None:
-        return None
-    with decoded(str(folder / SUMMARY), "the summary of a run"):
-        return {name: float(summary["optimal"][name]) for name in ("lower", "upper")}
+    optimal = summary["optimal"]
+    return optimal and {name: optimal[name] for name in ("lower", "upper")}
 
 
 def _compared(subject: str, report: dict[str, Any], simulation: Simulation | None) -> Table:

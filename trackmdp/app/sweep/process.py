@@ -26,6 +26,7 @@ from trackmdp.config import TrainConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import FAILED, USER_MISTAKE, Preempted, RunError, UserError
 from trackmdp.signals import handled
+from trackmdp.solvers.workers import end_with_parent
 from trackmdp.training.folders import DONE, FAILED_FILE, SUMMARY, run_of
 
 Launch = Callable[[Sequence[Job]], None]
@@ -193,20 +194,11 @@ def _run_in_child(job: Job, folder: Path, connection: Connection) -> None:
             sys.stdout.flush()
             os.dup2(stream.fileno(), 1)
     # A parent that is killed sends no signal to its children: they would go on alone, and hold their folders' locks.
-    threading.Thread(target=_stop_with_parent, daemon=True).start()
+    # Not by SIGTERM: where one came before, a second ends the run without saving.
+    end_with_parent(lambda: os.kill(os.getpid(), signal.SIGUSR1))
     outcome = _run(job)
     with connection:
         connection.send(outcome)
-
-
-def _stop_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        # Returns when the parent's sentinel closes, which the system does however it ends.
-        parent.join()
-        os.kill(
-            os.getpid(), signal.SIGUSR1
-        )  # not SIGTERM: where one came before, a second ends the run without saving
 
 
 def _run(job: Job) -> Outcome:

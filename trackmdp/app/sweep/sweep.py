@@ -16,9 +16,11 @@ from trackmdp.app.sweep.launchers import threads_of
 from trackmdp.app.sweep.plan import Job, progress
 from trackmdp.app.sweep.process import STOP, Launch, Outcome, fail
 from trackmdp.config import TrainConfig
+from trackmdp.config.options import is_number
 from trackmdp.config.resume import by_key, continued
 from trackmdp.durable import csv_text, write_text
 from trackmdp.errors import FAILED, USER_MISTAKE, Preempted, UserError
+from trackmdp.notebook.card import decimal
 from trackmdp.signals import Signals
 from trackmdp.training.display import table
 from trackmdp.training.folders import (
@@ -215,13 +217,7 @@ def write_table(sweep: Path, runs: Sequence[RunState]) -> None:
 
 def _cell(text: str | None) -> str | None:
     """Numbers as they are, also negative ones; a text that would be a formula is kept from being one."""
-    if text is None:
-        return None
-    try:
-        float(text)
-    except ValueError:
-        return no_formula(text)
-    return text
+    return text if text is None or is_number(text) else no_formula(text)
 
 
 def status_of(runs: Sequence[RunState]) -> int:
@@ -256,9 +252,4 @@ def run_figures(run: RunState) -> dict[str, Any]:
 
 def _short(run: RunState) -> list[str]:
     found = run_figures(run)
-    aihtr, regret = found.get("aihtr"), found.get("regret_per_step")
-    # Adding 0.0 turns the -0.0 that rounding leaves into 0.0.
-    return [
-        f"{aihtr:,.3f}" if aihtr is not None else "",
-        f"{round(regret, 4) + 0.0:.4f}" if regret is not None else "",
-    ]
+    return [decimal(found.get("aihtr")), decimal(found.get("regret_per_step"), 4)]
