@@ -160,7 +160,9 @@ def test_a_mean_budget_gives_two_policies_and_how_often_to_draw_each(tmp_path: P
     assert main([*words, "cost.mean_budget=0.7"]) == 0
     content = json.loads((tmp_path / "mean_budget.json").read_text(encoding="utf-8"))
     parts = content["parts"]
-    assert sum(each["probability"] * each["sensors"] for each in parts) == pytest.approx(0.7)
+    assert sum(each["probability"] * each["sensors_per_step"] for each in parts) == pytest.approx(
+        0.7
+    )
     assert content["lower"] == pytest.approx(content["upper"], rel=1e-5)
     assert (tmp_path / "mean_budget" / "1" / "sets.json").is_file()
     assert main([*words, "cost.mean_budget=9"]) == 0

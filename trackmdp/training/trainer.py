@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -188,18 +188,12 @@ class Trainer(Training):
 
     def _collect(self, iteration: int) -> TensorDictBase | None:
         """The next batch, None once all frames are in."""
-        try:
-            with _named(iteration), self._watch.waiting():
-                began = time.monotonic()
-                # None after the last batch: learners that replay have more iterations than batches.
-                batch = next(self._batches, None)
-                self.collecting += time.monotonic() - began
-        except RunError:
-            if not self._signals.heard():
-                raise
-            # The signal went to the worker processes too. Nothing has been learned since the last iteration, so that
-            # this is a state to save.
-            raise Preempted(self._signals.received) from None
+        # Where it is stopped, nothing has been learned since the last iteration, so that this is a state to save.
+        with self._asking(iteration):
+            began = time.monotonic()
+            # None after the last batch: learners that replay have more iterations than batches.
+            batch = next(self._batches, None)
+            self.collecting += time.monotonic() - began
         if batch is not None:
             for callback in self.callbacks:
                 callback.on_batch(self, batch)
@@ -214,18 +208,30 @@ class Trainer(Training):
                 f"iteration {iteration}: {error}; the last checkpoint holds a good state"
             ) from error
         if batch is not None:
-            self._send_weights(iteration)
+            # Where it is stopped, the last update is counted and saved, and then the run ends: nobody needs these
+            # weights, unless this was the last iteration, after which nobody does either.
+            with suppress(Preempted), self._asking(iteration):
+                self.collector.update_policy_weights_()
         return diagnostics
 
-    def _send_weights(self, iteration: int) -> None:
+    @contextmanager
+    def _asking(self, iteration: int) -> Iterator[None]:
+        """Around a call of the collector.
+
+        Raises:
+            Preempted: it failed since a signal ended the workers too.
+            RunError: it failed.
+        """
         try:
-            with _named(iteration), self._watch.waiting():
-                self.collector.update_policy_weights_()
-        except RunError:
-            # The signal ended the workers too. The last update is counted and saved, and then the run ends: nobody
-            # needs these weights, unless this was the last iteration, after which nobody does either.
-            if not self._signals.heard():
-                raise
+            with self._watch.waiting():
+                yield
+        except (RuntimeError, OSError) as error:
+            if self._signals.heard():
+                raise Preempted(self._signals.received) from None
+            why = f"collecting broke down ({reason(error)})"
+            raise RunError(
+                f"iteration {iteration}: {why}; resume=auto resumes from the last checkpoint"
+            ) from error
 
     def _account(self, diagnostics: dict[str, float], earned: float | None) -> None:
         """Evaluate where that is due, and call the callbacks; `earned`: mean reward of the batch's frames, if any."""
@@ -271,15 +277,3 @@ class Trainer(Training):
             "seconds": at.seconds,
             "frames_per_second": at.frames / at.seconds,
         }
-
-
-@contextmanager
-def _named(iteration: int) -> Iterator[None]:
-    """Name the iteration and the reason if collecting fails."""
-    try:
-        yield
-    except (RuntimeError, OSError) as error:
-        why = f"collecting broke down ({reason(error)})"
-        raise RunError(
-            f"iteration {iteration}: {why}; resume=auto resumes from the last checkpoint"
-        ) from error

@@ -34,10 +34,7 @@ def run(cfg: FrontierConfig, folder: Path, world: Problem) -> float:
     with reporting(console, f"frontier {cfg.solver.name}", _progress) as show:
         found = trace(world, cfg.solver, cfg.resolution, show)
     rows = [_row(number, corner, found) for number, corner in enumerate(found.corners)]
-    for number, corner in enumerate(found.corners):
-        own_folder(folder / "corners")
-        own_folder(place := folder / "corners" / f"{number}")
-        write_sets(place, corner.table)
+    write_corners(folder / "corners", found)
     lines = (["" if each is None else each for each in row.values()] for row in rows)
     write_text(folder / "frontier.csv", csv_text(rows[0], lines))
     write_json(folder / "frontier.json", _report(cfg, found, rows, {}))
@@ -50,8 +47,16 @@ def run(cfg: FrontierConfig, folder: Path, world: Problem) -> float:
     write_json(folder / "frontier.json", _report(cfg, found, rows, answers))
     _draw(folder, found, answers)
     for name, mixture in answers.items():
-        _show_mixture(console, f"{name}={given[name]:g}", mixture, found)
+        show_mixture(console, f"{name}={given[name]:g}", mixture, found)
     return float(len(found.corners))
+
+
+def write_corners(folder: Path, found: Tradeoff) -> None:
+    """Write the sets of each corner to `folder`/NUMBER."""
+    own_folder(folder)
+    for number, corner in enumerate(found.corners):
+        own_folder(place := folder / f"{number}")
+        write_sets(place, corner.table)
 
 
 def _draw(folder: Path, found: Tradeoff, answers: dict[str, Mixture]) -> None:
@@ -104,13 +109,19 @@ def _report(
         "equal_prices": found.equal_prices,
         "prices_solved": len(found.slopes),
         "corners": rows,
-        "answers": {name: _answer(mixture, found) for name, mixture in answers.items()},
+        "answers": {name: answer(mixture, found) for name, mixture in answers.items()},
     }
 
 
-def _answer(mixture: Mixture, found: Tradeoff) -> dict[str, Any]:
+def answer(mixture: Mixture, found: Tradeoff) -> dict[str, Any]:
+    """A mixture as the files have it."""
     parts = [
-        {"corner": found.corners.index(corner), "probability": weight}
+        {
+            "corner": found.corners.index(corner),
+            "probability": weight,
+            "price": corner.price,
+            "sensors_per_step": corner.sensors,
+        }
         for weight, corner in mixture.parts
     ]
     return {**_position(mixture, found), "parts": parts}
@@ -156,7 +167,7 @@ def _show(console: Console, found: Tradeoff, folder: Path) -> None:
     )
 
 
-def _show_mixture(console: Console, asked: str, mixture: Mixture, found: Tradeoff) -> None:
+def show_mixture(console: Console, asked: str, mixture: Mixture, found: Tradeoff) -> None:
     """The corners of a mixture with their probabilities, and the mixture itself."""
     rows = [
         [f"corner {found.corners.index(corner)}", f"{weight:.4f}", *_figures(corner, found)]

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from trackmdp.app.commands.frontier import answer, show_mixture, write_corners
 from trackmdp.config import SolveConfig
-from trackmdp.durable import own_folder, write_json
+from trackmdp.durable import write_json
 from trackmdp.errors import UserError
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.solvers import bounds, rules
@@ -146,41 +147,23 @@ def _show(
 def _on_average(
     at: Console, cfg: SolveConfig, world: World, solution: Solution, most: float, folder: Path
 ) -> None:
-    """The best policies with `most` sensors per step on average: `mean_budget.json`, and the sets of the two."""
+    """The best policies with `most` sensors per step on average: `mean_budget.json`, and the sets of the corners."""
     path, price = "mean_budget.json", float(np.nanmin(world.cost))
     if solution.evaluation.sensors_per_step <= most:
         write_json(folder / path, {"sensors": most, "binding": False})
         at.print(f"cost.mean_budget={most:g}: the policy above has fewer sensors per step")
         return
     found = trace(world, cfg.solver, 1e-3, near=most)
-    mixture, parts, value = found.at(sensors=most), [], 0.0
-    for number, (weight, corner) in enumerate(mixture.parts):
-        own_folder(folder / "mean_budget")
-        own_folder(place := folder / "mean_budget" / f"{number}")
-        write_sets(place, corner.table)
-        value += weight * value_of(world, corner.table, per_cell=False).aihtr
-        parts.append({"probability": weight, "price": corner.price, "sensors": corner.sensors})
-    upper = max(value, found.worth(most, price))
-    own = {"sensors": most, "binding": True, "lower": value, "upper": upper, "parts": parts}
-    write_json(folder / path, own)
-    heads = ["policy", "probability", "found at price", "sensors per step", "accuracy"]
-    rows = [
-        [
-            f"mean_budget/{n}",
-            f"{weight:.4f}",
-            f"{c.price:.5g}",
-            f"{c.sensors:.4f}",
-            f"{100 * c.accuracy:.2f} %",
-        ]
-        for n, (weight, c) in enumerate(mixture.parts)
-    ]
-    at.print(
-        table(
-            f"{most:g} sensors per step: a policy is drawn at the start of each episode",
-            heads,
-            rows,
-        )
+    mixture = found.at(sensors=most)
+    values = (
+        (weight, value_of(world, each.table, per_cell=False)) for weight, each in mixture.parts
     )
+    value = sum(weight * each.aihtr for weight, each in values)
+    upper = max(value, found.worth(most, price))
+    own = {"sensors": most, "binding": True, "lower": value, "upper": upper}
+    write_json(folder / path, own | answer(mixture, found))
+    write_corners(folder / "mean_budget", found)
+    show_mixture(at, f"cost.mean_budget={most:g}", mixture, found)
     at.print(
         f"mixture: AIHTR {value:,.6f}, no policy with as few sensors has more than {upper:,.6f}"
     )
