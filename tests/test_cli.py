@@ -128,7 +128,7 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         ),
         (
             "train -m seed=0,1 ++hydra.sweeper._target_=os.system",
-            "hydra.sweeper._target_: unknown option",
+            "hydra.sweeper._target_: unknown key",
         ),
         (
             "train +hydra.callbacks.x._target_=os.getcwd",

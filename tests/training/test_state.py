@@ -178,7 +178,6 @@ def forged(run: Path, **changes: Any) -> None:
     """The newest checkpoint of a run, saved again with parts changed."""
     state = {**checkpoint.load(checkpoint.newest(run)), **changes}
     iteration = state.pop("iteration")
-    state.pop("format")
     checkpoint.save(run / "checkpoints", iteration, state, keep=3)
 
 

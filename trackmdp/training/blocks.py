@@ -19,10 +19,8 @@ from rich.console import Console
 
 from trackmdp.algos.estimates.alike import cell_classes
 from trackmdp.config import TrainConfig, load_run_config
-from trackmdp.config.by_blocks import PartitionConfig
-from trackmdp.config.given import GivenKernelConfig, GivenSensorConfig
+from trackmdp.config.compose import compose
 from trackmdp.config.learning import AlgoConfig, file_of_classes
-from trackmdp.config.sensors import PaperCostConfig, PerfectSensorConfig
 from trackmdp.durable import own_folder, write_bytes, write_json
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
@@ -34,14 +32,14 @@ from trackmdp.training.callbacks import Callback, Learning, Position
 from trackmdp.training.display import make_console
 from trackmdp.training.evaluator import Score, make_evaluator
 from trackmdp.training.folders import SUMMARY, finished, read_summary
-from trackmdp.training.inputs import as_word, identity, problem_of, with_own_classes, write_inputs
+from trackmdp.training.inputs import identity, problem_of, with_own_classes, words_of, write_inputs
 from trackmdp.training.lock import locked
 from trackmdp.training.run import complete, load_run
 from trackmdp.training.trainer import Trainer
 from trackmdp.untrusted import decoded
 from trackmdp.world.group import Subject, one_target
 from trackmdp.world.model import World
-from trackmdp.world.problem_file import PROBLEM, problem_bytes, problem_digest
+from trackmdp.world.problem_file import PROBLEM, problem_bytes
 from trackmdp.world.tracks import modelled
 
 
@@ -182,29 +180,20 @@ class _BlockLearner:
         cfg, seen = self.config, sum(len(part.seen[0]) * len(part.seen[1]) for part in self.parts)
         # The frames of the run are shared out by the cells that blocks see, halos included.
         share = -(-cfg.collector.total_frames * world.num_cells // seen)
-        certain = world.perfect and world.safe
-        price = as_word(world.cost, folder)
+        given = compose("train", words_of(world, folder))
         return replace(
             cfg,
             seed=derive(cfg.seed, "block", number),
-            grid=replace(cfg.grid, size=list(world.size)),
-            kernel=GivenKernelConfig(
-                motion=True, modes=1, reveals=False, digest=problem_digest(world)[:16]
-            ),
-            cost=PaperCostConfig(
-                reward=world.reward,
-                sensor=price,
-                safe=world.safe_cost,
-                budget=None,
-                mean_budget=None,
-            ),
-            sensor=PerfectSensorConfig() if certain else GivenSensorConfig(wide=False),
+            grid=given.grid,
+            kernel=given.kernel,
+            cost=given.cost,
+            sensor=given.sensor,
             algo=self._algo(number, world, folder),
             collector=replace(
                 cfg.collector, total_frames=max(share, cfg.collector.frames_per_batch)
             ),
             optimal=replace(cfg.optimal, enabled=False),
-            partition=PartitionConfig(block=None, halo=None, workers=1, cluster=None),
+            partition=given.partition,
             resume="auto",
             quiet=True,
         )

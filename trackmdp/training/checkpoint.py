@@ -21,7 +21,6 @@ CHECKPOINT_FORMAT = 5
 BEST, LAST = "best.pt", "last.pt"
 _SEAL = 128
 _LARGEST = 2**38
-_NAME = re.compile(r"iteration-\d{8}\.pt")
 
 
 def save(
@@ -38,7 +37,7 @@ def save(
     # best.pt (put right by the run that resumes), the removal of old files (done by the next saving).
     with whole_file(file) as stream:
         try:
-            torch.save({"format": CHECKPOINT_FORMAT, "iteration": iteration, **state}, stream)
+            torch.save({"iteration": iteration, **state}, stream)
         except RuntimeError as error:  # torch hides the reason of a failed write in it
             raise (error.__context__ if isinstance(error.__context__, OSError) else error) from None
         stream.seek(0)
@@ -67,7 +66,7 @@ def point(file: Path, *, best: bool) -> None:
 
 def available_checkpoints(folder: Path) -> list[Path]:
     """The ordinary files among the checkpoints in a run's folder of checkpoints, the newest first."""
-    found = [file for file in folder.glob("iteration-*.pt") if _NAME.fullmatch(file.name)]
+    found = folder.glob(f"iteration-{'[0-9]' * 8}.pt")
     # By name, which is by number: the names have eight digits each.
     return sorted(
         (file for file in found if file.is_file() and not file.is_symlink()), reverse=True
@@ -96,10 +95,7 @@ def load(file: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
     """
     with opened(file, most=_LARGEST) as stream, decoded(str(file), "a checkpoint that can be read"):
         _check(file, stream)
-        state = load_tensors(file, device)
-        if not isinstance(state, dict) or state.get("format") != CHECKPOINT_FORMAT:
-            raise UserError(f"{file}: not the state of a run")
-    return state
+        return dict(load_tensors(file, device))
 
 
 def _seal(digest: str) -> bytes:

@@ -119,36 +119,6 @@ def write_plan(
     write_json(sweep / PLAN, {"command": command, "line": line, "jobs": planned})
 
 
-def read_plan(sweep: Path) -> dict[str, Any]:
-    """The content of `sweep.json`: `command`, `line` and `jobs`.
-
-    Raises:
-        UserError: the folder is no sweep's.
-    """
-    content = known_object(sweep / PLAN, most=PLAN_BYTES)
-    jobs = content.get("jobs")
-    whole = isinstance(jobs, list) and all(
-        isinstance(job, dict)
-        and isinstance(job.get("folder"), str)
-        and isinstance(job.get("overrides"), list)
-        for job in jobs
-    )
-    if not whole or not content.keys() >= {"command", "line"}:
-        raise UserError(f"sweep={sweep}: expected the folder of a sweep, with {PLAN}")
-    return content
-
-
-def runs_of(sweep: Path) -> list[RunState]:
-    """All runs of a sweep, in the order planned.
-
-    Raises:
-        UserError: the folder is no sweep's.
-    """
-    return [
-        run_of(sweep / job["folder"], tuple(job["overrides"])) for job in read_plan(sweep)["jobs"]
-    ]
-
-
 def run_of(folder: Path, overrides: tuple[str, ...] = ()) -> RunState:
     """One run, as its folder shows it."""
     # Asked first: a resumed run is running although an earlier failure or summary may still be in its folder.

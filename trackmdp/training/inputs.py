@@ -6,6 +6,9 @@ import hashlib
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from trackmdp.algos.estimates.alike import cell_classes
 from trackmdp.config import TrainConfig
@@ -14,8 +17,8 @@ from trackmdp.config.learning import file_of_classes
 from trackmdp.config.resume import fixed_options
 from trackmdp.config.tree import config_text
 from trackmdp.durable import write_bytes, write_text
-from trackmdp.world.group import Subject, learned_in
-from trackmdp.world.make import make_problem
+from trackmdp.world.group import Group, Subject, learned_in
+from trackmdp.world.make import OF_TASK, make_problem
 from trackmdp.world.model import Array
 from trackmdp.world.problem_file import PROBLEM, problem_bytes, problem_digest, read_problem
 
@@ -52,7 +55,35 @@ def with_own_classes(config: TrainConfig, folder: Path) -> TrainConfig:
     return replace(config, algo=algo)
 
 
-def as_word(values: Array, folder: Path) -> float | str:
+def words_of(given: Subject, folder: Path | None, subject: Subject | None = None) -> dict[str, Any]:
+    """The options that a problem made in Python has words for; its arrays are in the run's `problem.npz`.
+
+    Args:
+        given: the problem.
+        folder: of the run.
+        subject: what is in that file, where it is not `given`.
+    """
+    words: dict[str, Any] = {"targets.count": len(given)} if isinstance(given, Group) else {}
+    problem = given.single if isinstance(given, Group) else given
+    for name, option in OF_TASK.items():
+        value = getattr(problem, name)
+        array = isinstance(value, np.ndarray)
+        words[option] = _as_word(value, folder or Path()) if array else value
+    if problem.memory == "cell":
+        words.pop("task.clip")  # nothing reads it
+    if not (problem.perfect and problem.safe and problem.coverage is None):
+        words |= {"sensor": "given", "sensor.wide": problem.coverage is not None}
+    return words | {
+        "grid.size": problem.rows if problem.rows == problem.columns else list(problem.size),
+        "kernel": "given",
+        "kernel.motion": problem.model is not None,
+        "kernel.modes": getattr(problem, "modes", 1),
+        "kernel.reveals": problem.revealed > 1,
+        "kernel.digest": problem_digest(subject or given)[:16],
+    }
+
+
+def _as_word(values: Array, folder: Path) -> float | str:
     """Numbers per cell or sensor as an option: the one number that all have, or the file of the run's arrays."""
     same = (values == values[0]).all()
     return float(values[0]) if same else str(folder.absolute() / PROBLEM)

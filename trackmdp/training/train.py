@@ -7,7 +7,6 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModuleBase,
@@ -23,14 +22,12 @@ from trackmdp.seeding import preserved_global_rng
 from trackmdp.training.blocks import make_trainer
 from trackmdp.training.callbacks import Callback
 from trackmdp.training.display import make_console
-from trackmdp.training.inputs import as_word
+from trackmdp.training.inputs import words_of
 from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
 from trackmdp.untrusted import reason
 from trackmdp.world.group import Group, Subject, learned_in
-from trackmdp.world.make import OF_TASK
 from trackmdp.world.observation import ObservationVector
-from trackmdp.world.problem_file import problem_digest
 from trackmdp.world.tracks import check_problem
 
 
@@ -115,10 +112,10 @@ def _config(
     problem: Subject, typed: dict[str, Any], folder: Path | None
 ) -> tuple[TrainConfig, Subject]:
     """The checked config, and what the learner learns in: of several targets all, or a single one."""
-    config: TrainConfig = compose("train", typed | _words(problem, folder))
+    config: TrainConfig = compose("train", typed | words_of(problem, folder))
     subject = learned_in(problem, config.targets.count, joint=config.algo.joint)
     if subject is not problem:  # the words name the problem that is in the run's folder
-        config = compose("train", typed | _words(problem, folder, subject))
+        config = compose("train", typed | words_of(problem, folder, subject))
     return config, subject
 
 
@@ -153,31 +150,3 @@ def _key(name: str) -> str:
     """The option, or group of them, that an argument names."""
     known = "." in name or name in options(TrainConfig) or name in GROUPS
     return name if known else f"algo.{name}"
-
-
-def _words(given: Subject, folder: Path | None, subject: Subject | None = None) -> dict[str, Any]:
-    """The options that a problem made in Python has words for; its arrays are in the run's `problem.npz`.
-
-    Args:
-        given: the problem.
-        folder: of the run.
-        subject: what is in that file, where it is not `given`.
-    """
-    words: dict[str, Any] = {"targets.count": len(given)} if isinstance(given, Group) else {}
-    problem = given.single if isinstance(given, Group) else given
-    for name, option in OF_TASK.items():
-        value = getattr(problem, name)
-        array = isinstance(value, np.ndarray)
-        words[option] = as_word(value, folder or Path()) if array else value
-    if problem.memory == "cell":
-        words.pop("task.clip")  # nothing reads it
-    if not (problem.perfect and problem.safe and problem.coverage is None):
-        words |= {"sensor": "given", "sensor.wide": problem.coverage is not None}
-    return words | {
-        "grid.size": problem.rows if problem.rows == problem.columns else list(problem.size),
-        "kernel": "given",
-        "kernel.motion": problem.model is not None,
-        "kernel.modes": getattr(problem, "modes", 1),
-        "kernel.reveals": problem.revealed > 1,
-        "kernel.digest": problem_digest(subject or given)[:16],
-    }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import multiprocessing
 import os
 import subprocess
@@ -15,6 +16,7 @@ import pytest
 
 from trackmdp.app.cli import main
 from trackmdp.app.sweep import process
+from trackmdp.training.folders import RunState, run_of
 
 ROOT = Path(__file__).parents[3]
 TINY = (
@@ -68,6 +70,12 @@ def started(folder: Path, *words: str, **kwargs: Any) -> subprocess.Popen[str]:
     )
     _started.append(process)
     return process
+
+
+def runs_of(folder: Path) -> list[RunState]:
+    """The runs of a sweep, in the order planned."""
+    jobs = json.loads((folder / "sweep.json").read_text())["jobs"]
+    return [run_of(folder / job["folder"], tuple(job["overrides"])) for job in jobs]
 
 
 def table(folder: Path) -> list[dict[str, str]]:

@@ -12,11 +12,11 @@ from typing import Any
 
 import pytest
 
-from tests.app.sweep.runs import TINY, here, nothing_left, started, states, swept, table
+from tests.app.sweep.runs import TINY, here, nothing_left, runs_of, started, states, swept, table
 from tests.typed import stub
 from trackmdp.app.cli import main
 from trackmdp.errors import adding
-from trackmdp.training.folders import run_of, runs_of
+from trackmdp.training.folders import run_of
 
 __all__ = ["here", "nothing_left"]
 

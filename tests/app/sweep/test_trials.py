@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from tests.app.sweep.runs import TINY, here, states, swept, table
+from tests.app.sweep.runs import TINY, here, runs_of, states, swept, table
 from tests.typed import stub
 from trackmdp.app.cli import main
 from trackmdp.errors import adding
-from trackmdp.training.folders import run_of, runs_of
+from trackmdp.training.folders import run_of
 
 __all__ = ["here"]
 

@@ -30,7 +30,6 @@ from trackmdp.training.folders import (
     RunState,
     finished,
     run_of,
-    runs_of,
     write_plan,
 )
 from trackmdp.training.lock import locked
@@ -85,7 +84,7 @@ def sweep(
             skipped |= done
             if stop.received:
                 break
-        runs = runs_of(folder)
+        runs = [run_of(job.folder, job.words) for job in jobs.values()]
         write_table(folder, runs)
         show_runs(console, runs, skipped, folder)
     if stop.received:
