@@ -29,27 +29,6 @@ if TYPE_CHECKING:
 WORLD_KEYS = ("grid", "kernel", "cost", "sensor")
 
 
-def typed_config(command: str, cfg: DictConfig, folder: Path) -> CommandConfig:
-    """The typed config with every check that needs no file; relative paths are those of `folder`.
-
-    Raises:
-        UserError: an option is unknown or not allowed.
-    """
-    typed = from_hydra(cfg, config.ROOTS[command], folder)
-    # A run that is resumed has a config of its own, which names its inputs; `prepare` checks them later.
-    if not getattr(typed, "resume", None):
-        _refuse_ignored(typed, cfg)
-    return typed
-
-
-def _refuse_ignored(typed: CommandConfig, composed: DictConfig) -> None:
-    """Refuse words of the command line that have no effect; a default that nothing reads is no mistake."""
-    if "hydra" in composed:
-        # As typed: an interpolation in a word that a later one replaces may be of no resolver there is.
-        as_typed: Any = OmegaConf.to_container(composed.hydra.overrides.task, resolve=False)
-        refuse_ignored(typed, by_key(as_typed))
-
-
 @dataclass(frozen=True)
 class Prepared:
     """A command that can be run: all that can be checked has been.
@@ -86,10 +65,11 @@ def prepare(command: str, composed: DictConfig, words: Sequence[str]) -> Prepare
     Raises:
         UserError: an option is not allowed, or the file it names is missing or not as expected.
     """
-    cfg = typed_config(command, composed, Path.cwd())
+    cfg = from_hydra(composed, config.ROOTS[command], Path.cwd())
     prepared = check(command, cfg, folder_of(composed, "hydra.run.dir"), words)
-    if getattr(cfg, "resume", None) and not (prepared.folder / "config.yaml").is_file():
-        _refuse_ignored(cfg, composed)  # there is no run yet: this begins one
+    # A run that goes on has a config of its own, which `check` has compared with the words.
+    if not (getattr(cfg, "resume", None) and (prepared.folder / "config.yaml").is_file()):
+        refuse_ignored(cfg, by_key(words))
     return prepared
 
 

@@ -12,9 +12,10 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from trackmdp.app.composer import Composer
-from trackmdp.app.prepare import typed_config
 from trackmdp.app.sweep.configs import Configs
 from trackmdp.app.sweep.plan import combinations, plan
+from trackmdp.config import ROOTS
+from trackmdp.config.compose import from_hydra
 from trackmdp.errors import UserError
 
 
@@ -56,7 +57,7 @@ def test_every_config_is_the_one_that_hydra_composes(
     compose = Counting(composer)
     configs = Configs("train", compose)
     for line in combinations([], words.split()):
-        expected = typed_config("train", composer(line), Path.cwd())
+        expected = from_hydra(composer(line), ROOTS["train"], Path.cwd())
         assert configs(line) == (expected, "")
     assert compose.calls == calls
 
@@ -67,7 +68,7 @@ def test_a_number_out_of_range_is_refused_as_hydra_refuses_it(bad: str, composer
     key = bad.partition("=")[0]
     assert configs([f"{key}=1"])[1] == ""
     refusals: list[Any] = []
-    for refuse in (configs, lambda words: typed_config("train", composer(words), Path.cwd())):
+    for refuse in (configs, lambda words: from_hydra(composer(words), ROOTS["train"], Path.cwd())):
         try:
             refusals.append(refuse([bad])[1])  # type: ignore[operator]
         except UserError as error:

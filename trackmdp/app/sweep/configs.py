@@ -11,10 +11,10 @@ from typing import Any
 from hydra.core.override_parser.types import OverrideType, ValueType
 from omegaconf import DictConfig, OmegaConf
 
-from trackmdp.app.prepare import typed_config
 from trackmdp.app.words import Compose, parsed
-from trackmdp.config import CommandConfig
+from trackmdp.config import ROOTS, CommandConfig
 from trackmdp.config.checks import refuse_ignored, validate
+from trackmdp.config.compose import from_hydra
 from trackmdp.config.options import as_float, leaves
 from trackmdp.config.resume import by_key
 from trackmdp.config.tree import flatten
@@ -52,11 +52,14 @@ class Configs:
         composed: Any = self._compose(words) if known is None else None
         try:
             if known is not None:
-                return _changed(known, words, numbers), ""
-            cfg = typed_config(self._command, composed, Path.cwd())
+                cfg = _changed(known, numbers)
+            else:
+                cfg = from_hydra(composed, ROOTS[self._command], Path.cwd())
+                self._keep(words, numbers, cfg, composed)
+            if not getattr(cfg, "resume", None):  # a run that goes on has a config of its own
+                refuse_ignored(cfg, by_key(words))
         except UserError as error:
             return None, str(error)
-        self._keep(words, numbers, cfg, composed)
         return cfg, ""
 
     def _split(self, words: Sequence[str]) -> tuple[tuple[str, ...], Numbers]:
@@ -99,7 +102,7 @@ def _kinds(cfg: CommandConfig) -> dict[str, Any]:
     return {key: described.kind for key, described, _ in leaves(cfg)}
 
 
-def _changed(cfg: CommandConfig, words: Sequence[str], numbers: Numbers) -> CommandConfig:
+def _changed(cfg: CommandConfig, numbers: Numbers) -> CommandConfig:
     """A config with other numbers, checked.
 
     Raises:
@@ -110,8 +113,6 @@ def _changed(cfg: CommandConfig, words: Sequence[str], numbers: Numbers) -> Comm
         number = as_float(value) if kinds[key] is float and type(value) is int else value
         cfg = _replaced(cfg, key.split("."), number)
     validate(cfg)
-    if not getattr(cfg, "resume", None):
-        refuse_ignored(cfg, by_key(words))
     return cfg
 
 
