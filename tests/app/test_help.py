@@ -12,7 +12,7 @@ from tests.config.cases import of_command
 from tests.typed import ENVIRONMENT, refused
 from trackmdp import __version__
 from trackmdp.app.cli import COMMANDS, main
-from trackmdp.app.manual import EXAMPLES, LINES, USED
+from trackmdp.app.manual import EXAMPLES, USED
 from trackmdp.config import GROUPS, ROOTS, options
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
@@ -38,11 +38,11 @@ def test_help_names_every_option_with_range_unit_and_default(
 
 @pytest.mark.parametrize("command", USED)
 def test_help_fits_a_screen(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """At most 80 lines of 80 columns: the options used most, every group's choices, the way to the other options."""
+    """80 lines of 80 columns: the options used most, every group's choices, the way to the other options."""
     assert main([command, "--help"]) == 0
     text = capsys.readouterr().out
     lines = text.splitlines()
-    assert len(lines) <= LINES and max(map(len, lines)) < 80
+    assert len(lines) <= 80 and max(map(len, lines)) < 80
     every = dict(of_command(command))
     for key in USED[command]:
         assert f"  {key}=" in text and every[key].help in " ".join(text.split()), key

@@ -52,34 +52,22 @@ EXAMPLES = {
 }
 """Command -> lines that can be typed as they stand, once the named files exist."""
 
-USED = {
-    "train": [
-        *("grid.size", "grid.t_max", "grid.max_steps", "grid.window", "task.memory"),
-        *("cost.sensor", "cost.safe", "seed", "device", "threads", "resume", "init_from"),
-        *("evaluation.every", "optimal.enabled"),
-    ],
-    "evaluate": [
-        *("run", "episodes", "grid.size", "grid.t_max", "grid.window", "task.memory"),
-        *("cost.sensor", "cost.safe", "seed"),
-    ],
-    "compare": ["runs", "baselines", "grid.size", "grid.t_max", "cost.sensor", "cost.safe"],
-    "solve": [
-        *("grid.size", "grid.t_max", "grid.window", "task.memory", "cost.sensor", "cost.safe"),
-        *("partition.block", "partition.workers", "verify"),
-    ],
-    "frontier": [
-        *("grid.size", "grid.t_max", "cost.sensor", "cost.safe"),
-        *("accuracy", "sensors", "resolution"),
-    ],
-    "verify": ["grid.size", "grid.t_max", "cost.sensor", "cost.safe", "tolerance"],
-    "replay": ["file", "episode", "verify", "recover", "html", "csv", "layout", "speed"],
-    "report": ["sweep", "watch", "paper", "threshold", "every"],
-    "export": ["run", "format", "checkpoint"],
+_USED = {
+    "train": "grid.size grid.t_max grid.max_steps grid.window task.memory cost.sensor cost.safe "
+    "seed device threads resume init_from evaluation.every optimal.enabled",
+    "evaluate": "run episodes grid.size grid.t_max grid.window task.memory cost.sensor cost.safe "
+    "seed",
+    "compare": "runs baselines grid.size grid.t_max cost.sensor cost.safe",
+    "solve": "grid.size grid.t_max grid.window task.memory cost.sensor cost.safe partition.block "
+    "partition.workers verify",
+    "frontier": "grid.size grid.t_max cost.sensor cost.safe accuracy sensors resolution",
+    "verify": "grid.size grid.t_max cost.sensor cost.safe tolerance",
+    "replay": "file episode verify recover html csv layout speed",
+    "report": "sweep watch paper threshold every",
+    "export": "run format checkpoint",
 }
+USED = {command: words.split() for command, words in _USED.items()}
 """Command -> the options of `--help`, in reading order."""
-
-LINES = 80
-"""Lines of `--help`, at most."""
 
 _FLAGS = {
     "-m, --multirun": "run once for every combination of option=a,b,c, each in a process of its own",

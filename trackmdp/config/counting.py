@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from trackmdp.config.learning import EveryTaskConfig, check_classes
+from trackmdp.config.learning import EveryTaskConfig
 from trackmdp.config.options import (
     BYTES,
+    TABLE,
     Sizes,
     choice,
     count_option,
@@ -55,12 +56,12 @@ class ModelBasedConfig(EveryTaskConfig):
         "count moves of all cells, or of those of one class, together that are as far from each border; null: of all "
         "cells where the sensed moves show no difference",
         "all, none, or a path to a .npy, .npz or .csv file of the class of each cell",
+        pattern=f"all|none|{TABLE}",
         words=("all", "none"),
     )
 
     def check(self, key: str, root: Any) -> None:
-        """The file of the classes is a table; where a detection reveals the mode, cells do not move alike."""
-        check_classes(f"{key}.share_cells", self)
+        """Where a detection reveals the mode, cells do not move alike."""
         if root.kernel.hides and root.kernel.reveals and self.share_cells not in (None, "none"):
             raise refuse(
                 f"{key}.share_cells", self.share_cells, "none or null with kernel.reveals=true"

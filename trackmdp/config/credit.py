@@ -9,11 +9,11 @@ from trackmdp.config.learning import (
     LEARNING_RATE,
     EveryTaskConfig,
     ScheduleConfig,
-    check_classes,
     networks,
 )
 from trackmdp.config.options import (
     BYTES,
+    TABLE,
     Sizes,
     choice,
     count_option,
@@ -72,6 +72,7 @@ class PerSensorConfig(EveryTaskConfig):
         "assume that the target moves alike from all cells, or from those of one class, and learn one policy for all "
         "with the same surroundings; with one price for all sensors",
         "all, none, or a path to a .npy, .npz or .csv file of the class of each cell",
+        pattern=f"all|none|{TABLE}",
         words=("all", "none"),
     )
     exchange: bool = option(
@@ -85,7 +86,6 @@ class PerSensorConfig(EveryTaskConfig):
 
     def check(self, key: str, root: Any) -> None:
         """`explore` is a probability."""
-        check_classes(f"{key}.share_cells", self)
         for end in ("start", "end"):
             if (probability := getattr(self.explore, end)) > 1:
                 raise refuse(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import re
 from typing import Any, ClassVar
 
 from trackmdp.config.checks import unknown_option, validate
 from trackmdp.config.options import (
     GROUPS,
-    TABLES,
+    TABLE,
     Option,
     choice,
     file_option,
@@ -165,7 +165,7 @@ def _regime(key: str, entry: Any, root: Any) -> dict[str, Any]:
     Raises:
         UserError: there is no such kernel of cells, or an option is not allowed.
     """
-    if isinstance(entry, str) and Path(entry).suffix in TABLES:
+    if isinstance(entry, str) and re.fullmatch(TABLE, entry):
         entry = {"kernel": "table", "path": entry}
     known = [
         name for name, schema in GROUPS["kernel"].items() if schema.is_motion and not schema.hides

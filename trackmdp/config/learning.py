@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, ClassVar
 
 from trackmdp.cluster import ADDRESS
 from trackmdp.config.options import (
     BYTES,
-    TABLES,
     ChoiceConfig,
     NodeConfig,
     Sizes,
@@ -284,14 +282,6 @@ def file_of_classes(algo: AlgoConfig) -> str | None:
     """The file that `share_cells` names; None where it is one of its words, or the algorithm has no such option."""
     given: str | None = getattr(algo, "share_cells", None)
     return None if given in ("all", "none") else given
-
-
-def check_classes(key: str, algo: AlgoConfig) -> None:
-    """Refuse a text that is neither a word of `share_cells` nor the name of a table."""
-    given = file_of_classes(algo)
-    if given is not None and Path(given).suffix not in TABLES:
-        expected = "all, none, or a path to a .npy, .npz or .csv file"
-        raise refuse(key, given, expected)
 
 
 def together(root: Any) -> int:

@@ -168,8 +168,8 @@ def nested(help: str) -> Any:
     return dataclasses.field(metadata={"nested": help})
 
 
-TABLES = (".npy", ".npz", ".csv")
-"""Endings of the files with a table of numbers."""
+TABLE = r".+\.(npy|npz|csv)"
+"""Pattern of the path of a table of numbers."""
 
 BYTES = {"float32": 4, "int64": 8, "float64": 8, "int16": 2, "bool": 1}
 """Bytes of one number of each kind, for `needs`."""

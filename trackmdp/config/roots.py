@@ -86,16 +86,23 @@ class CheckpointConfig(NodeConfig):
     keep: int = count_option("newest checkpoints kept")
 
 
-class TrainConfig(WorldConfig):
+class ComputingConfig(WorldConfig):
+    """Common options of the commands that compute by torch."""
+
+    device: str = option(
+        "device of networks and of simulations",
+        expects="cpu, cuda, cuda:N or auto",
+        pattern=DEVICE,
+    )
+    threads: int = count_option("torch threads of this process", unit="threads", le=256)
+
+
+class TrainConfig(ComputingConfig):
     """Learn a policy without the motion model, and evaluate it exactly."""
 
     needs_motion: ClassVar[bool] = False
     learns: ClassVar[bool] = True
     seed: int = option("every random draw of the run derives from it", ge=0)
-    device: str = option(
-        "device the networks live on", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE
-    )
-    threads: int = count_option("torch threads of the learning process", unit="threads", le=256)
     task: TaskConfig
     algo: AlgoConfig
     collector: CollectorConfig
@@ -124,7 +131,7 @@ class TrainConfig(WorldConfig):
                 raise refuse("log", listed(self.log), f"one without mcap {several}")
 
 
-class EvaluateConfig(WorldConfig):
+class EvaluateConfig(ComputingConfig):
     """Value a trained policy (run=) or a baseline (baseline=), exactly and by simulation."""
 
     needs_motion: ClassVar[bool] = False
@@ -137,10 +144,6 @@ class EvaluateConfig(WorldConfig):
     evaluation: WidthConfig
     log: dict[str, LogConfig]
     seed: int = option("seed of the simulated episodes", ge=0)
-    device: str = option(
-        "device of the simulation", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE
-    )
-    threads: int = count_option("torch threads", unit="threads", le=256)
     episodes: int = option("episodes simulated; 0 = exact figures only", unit="episodes", ge=0)
 
     def check(self, key: str, root: Any) -> None:

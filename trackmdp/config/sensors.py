@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import re
 from typing import Any, ClassVar
 
 from trackmdp.config.options import (
-    TABLES,
+    TABLE,
     ChoiceConfig,
     Option,
     choice,
@@ -210,6 +210,7 @@ class FootprintConfig(MissConfig):
         "file in place of the lattice: a row per sensor, 1 in the column of each cell that it covers, or the "
         "probability of a report there, a factor on p_d",
         "a path to a .npz (scipy.sparse.save_npz or an array), .npy or .csv file",
+        pattern=TABLE,
     )
 
     def count(self, grid: GridConfig) -> int | None:
@@ -218,9 +219,7 @@ class FootprintConfig(MissConfig):
         return None if self.path is not None else rows * columns
 
     def check(self, key: str, root: Any) -> None:
-        """A file of a known kind; options that exclude footprints are refused."""
-        if self.path is not None and Path(self.path).suffix not in TABLES:
-            raise refuse(f"{key}.path", self.path, "a path to a .npz, .npy or .csv file")
+        """Options that exclude footprints are refused."""
         super().check(key, root)
         self._check_solver(key, root)
 
@@ -268,7 +267,7 @@ def _check_per_cell(
             if not (some if each is None else number.allows(each)):
                 raise refuse(f"{key}[{index}]", each, f"a {allowed}" + ", or null" * some)
         return
-    fine = Path(value).suffix in TABLES if isinstance(value, str) else number.allows(value)
+    fine = re.fullmatch(TABLE, value) if isinstance(value, str) else number.allows(value)
     if value is None or not fine:
         several = "" if count is None else f" of {count} of them"
         expected = f"a {allowed}, a list{several} (one per {each_of}), or a path to a .npy, .npz or .csv file"

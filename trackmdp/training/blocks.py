@@ -36,7 +36,6 @@ from trackmdp.training.inputs import identity, problem_of, with_own_classes, wor
 from trackmdp.training.lock import locked
 from trackmdp.training.run import complete, load_run
 from trackmdp.training.trainer import Trainer
-from trackmdp.untrusted import decoded
 from trackmdp.world.group import Subject, one_target
 from trackmdp.world.model import World
 from trackmdp.world.problem_file import PROBLEM, problem_bytes
@@ -107,12 +106,9 @@ class BlockTrainer(Learning):
             config = with_own_classes(self.config, place) if resumed else self.config
             learner = _BlockLearner(config, place.absolute() / "blocks", parts)
             table = plan_by_blocks(world, learner, side, halo, run)
-            with decoded(str(place / "blocks"), "the runs of blocks"):
-                ends = [read_summary(learner.place(number)) for number in range(len(parts))]
-                earned = sum(
-                    end["frames"] * end["while_collecting"]["reward_per_frame"] for end in ends
-                )
-                frames = sum(end["frames"] for end in ends)
+            ends = [read_summary(learner.place(number)) for number in range(len(parts))]
+        earned = sum(end["frames"] * end["while_collecting"]["reward_per_frame"] for end in ends)
+        frames = sum(end["frames"] for end in ends)
         self._policy, self.evaluator = Policy.from_table(table), make_evaluator(world)
         self.position = Position(0, frames, time.monotonic() - began, earned)
         score = self.evaluator.score(self._policy)

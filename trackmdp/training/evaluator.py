@@ -17,7 +17,7 @@ from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluation import Evaluation, ReplayedTracks, regret_per_step
 from trackmdp.solvers.hidden import averaged
 from trackmdp.solvers.value import replay, value_of
-from trackmdp.world.model import World
+from trackmdp.world.model import Task, World
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 
 ESTIMATED = "Q_MDP of the estimated kernel"
@@ -162,10 +162,7 @@ class HeldOutEvaluator(Evaluator):
                 cell, task.tracks, judge=task.validation, discount=gamma, rounds=rounds
             )
             found[CELL_ALONE] = plan.policy
-        if task.budget is None:
-            found["all on"] = PolicyTable.all_on(task)
-        found["no sensors"] = PolicyTable.none(task)
-        return found | {ESTIMATED: estimated_qmdp(task)}
+        return found | fixed_policies(task) | {ESTIMATED: estimated_qmdp(task)}
 
     def report(self, policy: PolicyTable) -> dict[str, Any]:
         """The report on a policy: its figures on the held-out tracks beside the references'."""
@@ -184,6 +181,12 @@ class HeldOutEvaluator(Evaluator):
             "tracks": self.tracks,
         }
         return {name: len(part) for name, part in counts.items()} | {"figures": figures}
+
+
+def fixed_policies(task: Task) -> dict[str, PolicyTable]:
+    """All sensors on, where the budget allows it, and none."""
+    all_on = {} if task.budget is not None else {"all on": PolicyTable.all_on(task)}
+    return all_on | {"no sensors": PolicyTable.none(task)}
 
 
 def estimated_qmdp(task: Recorded) -> PolicyTable:

@@ -144,7 +144,10 @@ class ResultLogger(RowLogger):
             with tempfile.TemporaryDirectory() as folder:
                 policy = Path(folder) / "policy.npz"
                 trainer.policy().save(policy)
-                self.results(final_figures(trainer), pictures, policy, trainer)
+                score = trainer.score
+                found = figures(score.evaluation) | {"regret_per_step": score.regret_per_step}
+                final = {f"final/{key}": value for key, value in known(found).items()}
+                self.results(final, pictures, policy, trainer)
         self.close(trainer.error)
 
     def results(
@@ -177,13 +180,6 @@ def pictures_of(trainer: Training) -> dict[str, Any]:
         label = "V(x), reward per episode"
         found["value"] = Heat("value by start cell", value.reshape(problem.size), label)
     return {name: each for name, each in found.items() if each is not None}
-
-
-def final_figures(trainer: Training) -> dict[str, float]:
-    """`final/...`: the figures of the last policy and its regret."""
-    score = trainer.score
-    found = figures(score.evaluation) | {"regret_per_step": score.regret_per_step}
-    return {f"final/{key}": value for key, value in known(found).items()}
 
 
 def known(row: Row) -> dict[str, float | int]:

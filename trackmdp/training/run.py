@@ -23,7 +23,6 @@ from trackmdp.errors import UserError
 from trackmdp.notebook.card import NONE, Card, Carded, decimal, grid_words
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import load_policy
-from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import group_rule
 from trackmdp.solvers.evaluation import Evaluation, figures
@@ -31,7 +30,7 @@ from trackmdp.solvers.solution import Solution
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Learning, Row, Training
 from trackmdp.training.devices import machine
-from trackmdp.training.evaluator import Evaluator, Score, while_collecting
+from trackmdp.training.evaluator import Evaluator, Score, fixed_policies, while_collecting
 from trackmdp.training.folders import SUMMARY, check_files, read_summary, write_summary
 from trackmdp.training.group_run import Several, beside, learned_policy
 from trackmdp.training.inputs import problem_of, with_own_classes
@@ -291,10 +290,8 @@ def references(evaluator: Evaluator, solution: Solution | None) -> dict[str, Any
     """Figures of the policies that a learned one is compared with, beside Q_MDP; none on recorded tracks."""
     if evaluator.qmdp is None:
         return {}
-    fixed = {"all on": PolicyTable.all_on, "no sensors": PolicyTable.none}
-    if evaluator.world.budget is not None:
-        del fixed["all on"]
-    found = {name: evaluator.evaluate(make(evaluator.world)) for name, make in fixed.items()}
+    fixed = fixed_policies(evaluator.world).items()
+    found = {name: evaluator.evaluate(policy) for name, policy in fixed}
     if solution is not None:
         found["best known"] = solution.evaluation
     return {name: figures(each) for name, each in found.items()}
