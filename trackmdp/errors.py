@@ -41,7 +41,7 @@ class Preempted(BaseException):
         return f"stopped by signal {self.signal}"
 
 
-def first_line(error: BaseException) -> str:
+def message_of(error: BaseException) -> str:
     """The first line of an error's message, or the name of its class."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0].strip()
 

@@ -185,17 +185,6 @@ def test_a_block_that_runs_elsewhere_is_refused(tmp_path: Path) -> None:
         learned(tmp_path)
 
 
-@pytest.mark.parametrize(
-    "end", [{}, {"frames": 600, "while_collecting": {"reward_per_frame": None}}]
-)
-def test_a_block_that_tells_no_frames_is_refused(
-    uncut: tm.Run, end: dict[str, Any], monkeypatch: Any
-) -> None:
-    monkeypatch.setattr("trackmdp.training.blocks.read_summary", lambda folder: end)
-    with pytest.raises(UserError, match="blocks: not the runs of blocks"):
-        learned(uncut.folder, resume="auto")
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1])
 def test_a_signal_between_two_blocks_ends_the_run(
     number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

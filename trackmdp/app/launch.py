@@ -36,7 +36,7 @@ from trackmdp.config import GROUPS, ROOTS
 from trackmdp.config.checks import validate
 from trackmdp.config.registry import maker
 from trackmdp.config.tree import build_config
-from trackmdp.errors import UserError, first_line
+from trackmdp.errors import UserError, message_of
 
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
@@ -227,7 +227,7 @@ def answer(compose: Composer, args: argparse.Namespace) -> bool:
         else:
             hydra.shell_completion(compose.name, compose.words)
     except Exception as error:  # of many kinds; all are about the command line
-        raise UserError(first_line(error)) from error
+        raise UserError(message_of(error)) from error
     return True
 
 

@@ -20,7 +20,7 @@ from trackmdp.config.compose import from_hydra
 from trackmdp.config.learning import file_of_classes
 from trackmdp.config.logs import require_packages
 from trackmdp.config.resume import by_key, continued, key_of, run_folder
-from trackmdp.errors import UserError, first_line
+from trackmdp.errors import UserError, message_of
 from trackmdp.imports import importing
 
 if TYPE_CHECKING:
@@ -222,7 +222,7 @@ def folder_of(cfg: DictConfig, key: str) -> Path:
     try:
         value = OmegaConf.select(cfg, key)  # None for a missing key, and for "???"
     except Exception as error:  # a resolver of `${name:...}` may raise anything
-        raise UserError(f"{key}: {first_line(error)}") from error
+        raise UserError(f"{key}: {message_of(error)}") from error
     if not isinstance(value, str):
         raise UserError(f"{key}: missing, expected a folder")
     folder = Path(value)

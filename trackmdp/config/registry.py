@@ -30,7 +30,7 @@ from omegaconf import AnyNode, OmegaConf
 from omegaconf.errors import OmegaConfBaseException, UnsupportedValueType
 
 from trackmdp.config.options import GROUPS, ChoiceConfig, options
-from trackmdp.errors import UserError, first_line
+from trackmdp.errors import UserError, message_of
 
 ENTRY_POINTS = "trackmdp.plugins"
 _FEW = 100
@@ -143,7 +143,7 @@ def resolved(values: dict[str, Any]) -> dict[str, Any]:
     except OmegaConfBaseException as error:
         # Its further lines (full_key, object_type) are about OmegaConf.
         where = f"{error.full_key}: " if isinstance(error, UnsupportedValueType) else ""
-        raise UserError(f"{where}{first_line(error)}") from error
+        raise UserError(f"{where}{message_of(error)}") from error
     return dict(plain)
 
 

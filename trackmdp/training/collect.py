@@ -14,7 +14,7 @@ from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, Mu
 from trackmdp.config import TrainConfig
 from trackmdp.config.learning import CollectorConfig, RayWorkersConfig, WorkersConfig
 from trackmdp.config.registry import maker
-from trackmdp.errors import RunError, first_line
+from trackmdp.errors import RunError, message_of
 from trackmdp.imports import safe_children
 from trackmdp.seeding import seed_global
 from trackmdp.solvers.workers import end_with_parent
@@ -105,7 +105,7 @@ def _in_workers(
             return kind(_of_workers(_worker_env, env, cfg, done), policy, **threads, **common)
         except (RuntimeError, EOFError, OSError) as error:
             # TorchRL's message has the worker's whole traceback from its second line on.
-            reason = first_line(error)
+            reason = message_of(error)
             raise RunError(f"collector={cfg.name}: a worker did not start ({reason})") from error
 
 

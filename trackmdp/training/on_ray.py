@@ -13,7 +13,7 @@ from torchrl.collectors.distributed import RayCollector
 
 from trackmdp.cluster import joining, ray_options
 from trackmdp.config.learning import RayWorkersConfig
-from trackmdp.errors import first_line, require
+from trackmdp.errors import message_of, require
 from trackmdp.world.env import TrackEnv
 
 _STORE = 2**30
@@ -77,7 +77,7 @@ def _losing() -> Iterator[None]:
     try:
         yield
     except RayError as error:
-        raise RuntimeError(f"a worker was lost: {first_line(error)}") from error
+        raise RuntimeError(f"a worker was lost: {message_of(error)}") from error
 
 
 def _rows(batch: TensorDictBase) -> TensorDictBase:

@@ -73,11 +73,11 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem) -> float:
     torch.set_num_threads(cfg.threads)
     device = make_device(cfg.device)
     believed = isinstance(cfg.sensor, FalseAlarmConfig)
-    if isinstance(cfg.baseline, PlaybackConfig) and not believed:
-        return _played_back(cfg, cfg.baseline, problem, folder, console)
     world: Subject
     if cfg.run:
         world, policy, subject = trained(cfg.run, device)
+    elif isinstance(cfg.baseline, PlaybackConfig) and not believed:
+        return _played_back(cfg, cfg.baseline, problem, folder, console)
     else:
         assert cfg.baseline is not None
         world, policy, subject = problem, baseline_policy(problem, cfg.baseline), cfg.baseline.name

@@ -109,11 +109,11 @@ def _report(
         "equal_prices": found.equal_prices,
         "prices_solved": len(found.slopes),
         "corners": rows,
-        "answers": {name: answer(mixture, found) for name, mixture in answers.items()},
+        "answers": {name: mixture_report(mixture, found) for name, mixture in answers.items()},
     }
 
 
-def answer(mixture: Mixture, found: Tradeoff) -> dict[str, Any]:
+def mixture_report(mixture: Mixture, found: Tradeoff) -> dict[str, Any]:
     """A mixture as the files have it."""
     parts = [
         {

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from trackmdp.app.commands.frontier import answer, show_mixture, write_corners
+from trackmdp.app.commands.frontier import mixture_report, show_mixture, write_corners
 from trackmdp.config import SolveConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import UserError
@@ -161,7 +161,7 @@ def _on_average(
     value = sum(weight * each.aihtr for weight, each in values)
     upper = max(value, found.worth(most, price))
     own = {"sensors": most, "binding": True, "lower": value, "upper": upper}
-    write_json(folder / path, own | answer(mixture, found))
+    write_json(folder / path, own | mixture_report(mixture, found))
     write_corners(folder / "mean_budget", found)
     show_mixture(at, f"cost.mean_budget={most:g}", mixture, found)
     at.print(
