@@ -392,3 +392,13 @@ def test_tracks_begin_at_the_recordings_clock() -> None:
     assert cells(tracks) == [[3, 4, 5], [5, 4, 3], [3]]
     assert tracks.begins is not None
     assert tracks.begins.tolist() == [0, 4, 1]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("far", [-1e300, 1e300])
+def test_the_clock_begins_with_the_first_track_that_is_kept(far: float) -> None:
+    """Target 2 has a single report in a cell, at any time: too short to be kept."""
+    reports = seen((0, 0, 5, 5), (0, 10, 25, 5), (1, 20, 5, 5), (1, 30, 25, 5), (2, far, 5, 5))
+    tracks, _ = made(reports, shortest=2)
+    assert tracks.begins is not None
+    assert tracks.begins.tolist() == [0, 4]

@@ -195,9 +195,11 @@ def _cut(
     exits = (left | (last[ends] & grid.exits))[kept]
     chosen = np.repeat(kept, lengths)
     first = begins[kept]
-    # Steps since the first report of all, to the nearest one; in its path a run begins some samples after the first.
+    # Steps since the first path that is kept, to the nearest one (another path may lie at any time, 10^300 s before);
+    # in its path a run begins some samples after the first.
     within = first - np.searchsorted(place, place[first])
-    clock = np.rint((flat.time[place[first]] - flat.time.min()) / grid.step).astype(np.int64)
+    time = flat.time[place[first]]
+    clock = np.rint((time - time.min(initial=np.inf)) / grid.step).astype(np.int64)
     made = Tracks(
         cells[inside][chosen],
         ends_of(lengths[kept]),
