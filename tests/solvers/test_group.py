@@ -15,7 +15,7 @@ from tests.solvers.worlds import random_tiny_world
 from trackmdp.app.cli import main
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
-from trackmdp.solvers import group_value
+from trackmdp.solvers import group_bounds, group_value
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.group_bounds import equal_shares, upper_bound
 from trackmdp.solvers.group_chain import explored
@@ -112,6 +112,15 @@ def test_brute_force_of_truncated_episodes_is_below_the_bound(seed: int, max_ste
         assert played.aihtr.low is not None
         half = played.aihtr.mean - played.aihtr.low
         assert abs(played.aihtr.mean - exact.aihtr.mean) < 2 * half + 1e-9
+
+
+@pytest.mark.parametrize("max_steps", [1, 2])
+def test_the_paired_bound_counts_the_steps_allowed(max_steps: int) -> None:
+    world = tiny(0, max_steps=max_steps, reward=1.0)
+    found = group_bounds._Paired(world, world).value
+    # A target earns 1 a step at most, where it stays; with three quarters of a chance each time.
+    assert found.max() <= sum(0.75**step for step in range(1, max_steps + 1)) + 1e-12
+    assert found.max() > sum(0.75**step for step in range(1, max_steps))
 
 
 def test_targets_that_never_leave_are_followed_for_the_steps_allowed() -> None:

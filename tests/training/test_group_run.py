@@ -18,12 +18,14 @@ import trackmdp as tm
 from tests.training.runs import assert_same_run, at_iteration, train
 from trackmdp.app.cli import main
 from trackmdp.config import load_run_config
+from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.errors import Preempted, UserError
 from trackmdp.seeding import derive
 from trackmdp.solvers.evaluate import evaluate, group_rule
 from trackmdp.solvers.group_tracker import GroupTracker
 from trackmdp.solvers.group_value import evaluate_group
 from trackmdp.solvers.joint_rule import JointRule
+from trackmdp.solvers.merging import make_rule
 from trackmdp.solvers.solve import solve
 from trackmdp.training.inputs import problem_of
 from trackmdp.world.env import TrackEnv
@@ -146,7 +148,6 @@ def test_one_targets_plan_is_learned_and_merged(merge: str, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("words", "refusal"),
     [
-        (["algo=a2c", "log=[csv,mcap]"], "log=[csv,mcap]: expected one without mcap with targets"),
         (["algo=a2c", "partition.block=2"], "partition.block=2: expected null with targets.count"),
         (["algo=a2c", "targets.merge=union"], "targets.merge=union: without effect with algo=a2c"),
         (["targets.count=1", "targets.merge=union"], "without effect with targets.count=1"),
@@ -174,11 +175,76 @@ def test_what_several_targets_cannot_do_is_refused(
         tm.train(group(), "a2c", actor=run.policy.actor)
     with pytest.raises(UserError, match=r"learned for targets of the kinds \[0, 0\], expected"):
         evaluate(group(targets=3), run)
-    for words in (["export", "format=sets"], ["compare", "baseline=qmdp"]):
-        assert main([words[0], f"run={tmp_path}", *words[1:]]) == 2
-        assert "2 targets that were learned together, expected a single" in capsys.readouterr().err
+    assert main(["export", f"run={tmp_path}", "format=sets"]) == 2
+    assert "2 targets that were learned together, expected a single" in capsys.readouterr().err
     assert main(["evaluate", f"run={tmp_path}", "targets.count=3"]) == 2
     assert "targets.count=3: expected 2, as the policy has" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("algo", ["a2c", "dqn"])
+def test_episodes_are_logged_while_learning_and_verify_to_the_bit(
+    algo: str, tmp_path: Path
+) -> None:
+    few = FEW | BRIEF
+    mixed = Group([*group().worlds, tm.make_world("drift", size=3, exit_probability=0.2)])
+    more = {"log": ["csv", "mcap"], "log.mcap.episodes": 7, "evaluation.every": 1}
+    run = tm.train(mixed, algo, folder=tmp_path, **few, **more)
+    with EpisodeReader(tmp_path / "episodes.mcap") as reader:
+        assert len(reader) == 14  # after each of two iterations
+        assert verify(reader).difference is None
+        # The last policy of the log is the run's.
+        last = reader.policy(1)
+        assert isinstance(last, JointRule)
+        for name, part in last.packed()[0].items():
+            np.testing.assert_array_equal(part, run.policy.packed()[0][name])
+        # One at a time, as a batch of another size rounds otherwise.
+        assert verify(reader, numbers=[13]).difference is None
+
+
+def test_a_loaded_run_follows_targets_step_by_step(tmp_path: Path) -> None:
+    run = tm.train(group(), "a2c", folder=tmp_path, **FEW, **BRIEF)
+    tracker = tm.load_run(tmp_path).policy.tracker([0, 4])
+    episode = next(e for e in tm.simulate(group(), run, 300) if e.start.tolist() == [0, 4])
+    for t in range(len(episode)):
+        expected = range(9) if tracker.safe else np.flatnonzero(episode.action[t])
+        assert tracker.sensors() == list(expected)
+        seen = zip(episode.target[t].tolist(), episode.located[t], strict=True)
+        gone = np.flatnonzero(episode.target[t] == 9)
+        tracker.report([cell if found else None for cell, found in seen], gone.tolist())
+
+
+def test_runs_for_several_targets_are_compared_on_the_same_targets(tmp_path: Path) -> None:
+    runs = tmp_path / "joint", tmp_path / "merged"
+    words = {"total_frames": 4096, "frames_per_batch": 2048, "envs": 64}
+    joint = tm.train(group(), "a2c", folder=runs[0], **FEW, **BRIEF)
+    merged = tm.train(group(), "model_based", folder=runs[1], **words, **BRIEF)
+    compared = tm.compare(group(), {"joint": joint, "merged": merged, "again": joint})
+    assert compared.tracks is not None
+    assert "simulated episodes" in compared.about
+    totals = [
+        evaluate_group(group_rule(group(), each), episodes=compared.tracks).totals
+        for each in (joint, merged)
+    ]
+    difference = compared.policies[1].difference
+    assert difference.low is not None
+    assert difference.low <= (totals[1] - totals[0])[:, 0].mean() <= difference.mean + 1
+    assert difference.mean == pytest.approx((totals[1] - totals[0])[:, 0].mean(), abs=0.1)
+    again = compared.policies[2].difference
+    assert (again.mean, again.low, again.high) == (0.0, 0.0, 0.0)
+    main(["compare", *(f"run={run}" for run in runs), f"hydra.run.dir={tmp_path}", "quiet=true"])
+    written = json.loads((tmp_path / "comparison.json").read_text(encoding="utf-8"))
+    assert written["tracks"] == compared.tracks
+    assert written["policies"][1]["difference"]["mean"] == difference.mean
+    assert "(other problem)" not in written["policies"][1]["name"]
+
+
+def test_exact_figures_for_several_targets_are_compared_exactly() -> None:
+    union = make_rule(group(), [solve(group().kinds[0]).table], "union")
+    compared = tm.compare(group(), {"union": union, "gains": "optimal", "same": union})
+    assert compared.tracks is None
+    exact = [evaluate(group(), each).aihtr.mean for each in (union, "optimal")]
+    assert compared.policies[1].difference.mean == pytest.approx(exact[1] - exact[0])
+    assert compared.sentences[1] == "same earns the same as union (exact)."
 
 
 def below_the_bound(targets: Group, frames: int) -> float:

@@ -43,7 +43,14 @@ from trackmdp.config.roots import (
     WorldConfig,
 )
 from trackmdp.config.sensors import CostConfig, FalseAlarmConfig, PaperCostConfig, SensorConfig
-from trackmdp.config.tree import load_config, load_run_config, to_dict, to_yaml, world_of
+from trackmdp.config.tree import (
+    load_config,
+    load_run_config,
+    to_dict,
+    to_yaml,
+    train_config_of,
+    world_of,
+)
 from trackmdp.config.world import MEMORIES, KernelConfig, TableConfig
 
 load_plugins()  # at the end: they import the names above

@@ -127,8 +127,6 @@ class TrainConfig(ComputingConfig):
             several = f"with targets.count={self.targets.count} and algo={self.algo.name}"
             if self.partition.block is not None:
                 raise refuse("partition.block", self.partition.block, f"null {several}")
-            if "mcap" in self.log:
-                raise refuse("log", listed(self.log), f"one without mcap {several}")
 
 
 class EvaluateConfig(ComputingConfig):

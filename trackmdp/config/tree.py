@@ -85,6 +85,15 @@ def world_of(text: str | bytes) -> WorldConfig:
     return _checked({key: value for key, value in plain.items() if key in known}, WorldConfig)
 
 
+def train_config_of(text: str | bytes) -> TrainConfig:
+    """The config of a training run in the text of its `config.yaml`.
+
+    Raises:
+        UserError: there is none.
+    """
+    return _checked(parse_yaml(text, "config.yaml"), TrainConfig)
+
+
 def load_run_config(folder: str | Path) -> TrainConfig:
     """The config of a training run.
 

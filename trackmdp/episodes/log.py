@@ -21,7 +21,7 @@ from trackmdp.policies.policy import Policy, PolicyLike
 from trackmdp.training.callbacks import Callback, Training
 from trackmdp.training.evaluator import Score
 from trackmdp.untrusted import reason
-from trackmdp.world.group import Group, one_target
+from trackmdp.world.group import Group
 from trackmdp.world.tracks import Problem
 
 
@@ -156,7 +156,7 @@ class EpisodeLogger(Callback):
     def on_start(self, trainer: Training) -> None:
         """Open the log; episodes after the last checkpoint of an earlier process are cut off."""
         # Held-out tracks are for the end.
-        problem = one_target(trainer.problem, "log=[mcap]").selection
+        problem = trainer.problem.selection
 
         def tell(line: str) -> None:
             self._lost = line

@@ -13,6 +13,7 @@ from typing import Any
 
 from tensordict import TensorDict
 
+from trackmdp.config import train_config_of
 from trackmdp.episodes import schema
 from trackmdp.episodes.container import Container, Damaged, Said, reading
 from trackmdp.episodes.episode import Recording, first_difference
@@ -23,6 +24,7 @@ from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import unpacked_policy
 from trackmdp.solvers.merging import Rule, make_rule
+from trackmdp.training.group_run import joint_policy
 from trackmdp.untrusted import load_npz
 from trackmdp.world.group import Group
 from trackmdp.world.problem_file import PROBLEM, problem_in
@@ -145,7 +147,11 @@ class EpisodeReader:
             clip, revealed = int(facts["clip"]), int(facts["revealed"])
             task = task.remembering(facts["memory"], clip=clip, revealed=revealed)
         with reading(self.file):
-            found = [unpacked_policy(task, load_npz(io.BytesIO(table))) for table in tables]
+            arrays = [load_npz(io.BytesIO(table)) for table in tables]
+            if facts.get("merge") == "joint":
+                cfg = train_config_of(self.attachment(schema.TABLES[0]))
+                return joint_policy(cfg, problem, arrays[0])
+            found = [unpacked_policy(task, each) for each in arrays]
             if isinstance(problem, Group):
                 return make_rule(problem, found, facts["merge"])
             return Policy.from_table(found[0])

@@ -232,7 +232,9 @@ class LoggedRun:
         """Name -> digest of the attachments with the tables of a policy; empty where it has none."""
         if not facts[table_digest(0)]:
             return {}
-        return {policy_file(number, kind): facts[table_digest(kind)] for kind in self.motions}
+        # The weights of networks that read all targets are in one file.
+        kinds = (0,) if facts.get("merge") == "joint" else self.motions
+        return {policy_file(number, kind): facts[table_digest(kind)] for kind in kinds}
 
     @property
     def schemas(self) -> dict[str, tuple[str, dict[str, Any]]]:

@@ -127,7 +127,7 @@ class EpisodeWriter:
         if policy is None:
             return self.copy_policy(facts, [])
         if isinstance(policy, Rule):
-            tables = [npz_bytes(packed(table)) for table in policy.tables]
+            tables = list(map(npz_bytes, policy.packed()))
             return self.copy_policy({**facts, "merge": policy.name}, tables)
         if policy.task.keyed:
             known = {

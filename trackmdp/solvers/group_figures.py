@@ -81,6 +81,15 @@ class GroupEvaluation(Carded):
         """Safe actions per step."""
         return self._ratio(4, 5)
 
+    def less(self, other: GroupEvaluation) -> GroupEvaluation:
+        """The differences of all totals to those of another policy for the same targets."""
+        controls = None
+        if self.controls and other.controls:
+            mine, theirs = self.controls, other.controls
+            controls = mine[0] - theirs[0], mine[1] - theirs[1]
+        totals = self.totals - other.totals
+        return GroupEvaluation(totals, self.exact, self.expected_length, controls)
+
     @property
     def about(self) -> str:
         """What the figures are means over."""
@@ -109,7 +118,7 @@ def with_ends(found: MeanInterval) -> str:
     if found.low is None or found.high is None or found.low == found.high:
         return decimal(found.mean, 4)
     above, below = found.high - found.mean, found.mean - found.low
-    if abs(above - below) > 1e-6 * (above + below):
+    if abs(above - below) > 0.1 * (above + below):
         ends = f"{decimal(found.low, 4)} to {decimal(found.high, 4)}"
         return f"{decimal(found.mean, 4)} ({ends})"
     return f"{decimal(found.mean, 4)} ± {decimal(above, 4)}"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from trackmdp.durable import write_bytes
 from trackmdp.errors import UserError
+from trackmdp.solvers.group_tracker import GroupTracker
 from trackmdp.solvers.linear import IndexArray
 from trackmdp.solvers.merging import Beliefs, Clocks, Rule
 from trackmdp.world.files import npz_bytes
@@ -35,7 +38,9 @@ class JointRule(Rule):
 
     def __init__(self, group: Group, actor: TensorDictModuleBase, device: torch.device) -> None:
         super().__init__(group, ())
-        self._device, self.actor = device, copy.deepcopy(actor).to(device)
+        # Rounding differs with the number of rows of a batch. In double precision that does not turn a set over, so
+        # that an episode that is simulated again, beside others, is the same.
+        self._device, self.actor = device, copy.deepcopy(actor).to(device).double()
 
     def within(self, group: Group) -> JointRule:
         """See `Rule`."""
@@ -75,7 +80,16 @@ class JointRule(Rule):
         chosen: BoolArray = action & self.task.available
         return chosen
 
+    def tracker(self, cells: Sequence[int]) -> GroupTracker:
+        """A tracker that follows targets located in `cells`, one for each."""
+        return GroupTracker(self, cells)
+
+    def packed(self) -> list[dict[str, Any]]:
+        """The weights by their names, in single precision as they were learned, and the kind of each target."""
+        weights = self.actor.state_dict().items()
+        found = {name: part.to(torch.float32).cpu().numpy() for name, part in weights}
+        return [{"targets": np.array(self.group.targets), **found}]
+
     def save(self, file: Path, value: Array | None = None) -> None:  # noqa: ARG002 (there is none)
-        """Write the weights by their names, and the kind of each target; the same weights, the same bytes."""
-        weights = {name: part.cpu().numpy() for name, part in self.actor.state_dict().items()}
-        write_bytes(file, npz_bytes({"targets": np.array(self.group.targets)} | weights))
+        """Write `packed`; the same weights, the same bytes."""
+        write_bytes(file, npz_bytes(self.packed()[0]))

@@ -19,12 +19,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from scipy import sparse
 
 from trackmdp.errors import UserError
+from trackmdp.policies.saved import packed
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.choose import largest
 from trackmdp.solvers.linear import IndexArray, per_row
@@ -164,6 +165,10 @@ class Rule(ABC):
         """For each kind `[M, S]`, the set of a single target that is located."""
         return [sparse.csr_array(_sets(table)[:: self.task.num_choices]) for table in self.tables]
 
+    def packed(self) -> list[dict[str, Any]]:
+        """The arrays from which it is made again, of each kind."""
+        return [packed(table) for table in self.tables]
+
     @abstractmethod
     def sets(self, seen: Clocks, moved: Beliefs) -> IndexArray:
         """Sorted numbers e · S + j of the sensors j that are on in episode e.
@@ -213,8 +218,7 @@ class Merged(Rule):
             [(list[IndexArray](), list[Array]()) for _ in range(self.task.num_choices)],
         )
         # Plans are those of whole episodes, also where these are cut off.
-        whole = self.group.but(max_steps=None) if self.task.max_steps else self.group
-        for kind, (world, table) in enumerate(zip(whole.kinds, self.tables, strict=True)):
+        for kind, (world, table) in enumerate(zip(self.group.kinds, self.tables, strict=True)):
             renewal = Renewal(world, world.motion)
             sets = renewal.sets(table)
             value = renewal.value(sets)

@@ -11,10 +11,14 @@ import numpy as np
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, decimal, percent
 from trackmdp.policies.policy import Policy, as_policy
+from trackmdp.solvers.evaluate import group_rule
+from trackmdp.solvers.group_value import evaluate_group
+from trackmdp.solvers.merging import Rule
 from trackmdp.solvers.solve import named_policy
 from trackmdp.solvers.value import replay, value_of
 from trackmdp.statistics import MeanInterval, ratio
 from trackmdp.training.evaluator import estimated_qmdp
+from trackmdp.world.group import Group, Subject
 from trackmdp.world.tracks import Problem, Recorded, check_problem
 
 FIGURES = ("aihtr", "accuracy", "sensors_per_step")
@@ -22,6 +26,8 @@ Figures: TypeAlias = dict[str, MeanInterval]
 
 _SAME = 1e-9
 """Relative difference of two exact values below which they are the same up to rounding."""
+_PLAYED = 1_000
+"""Episodes of several targets where the first policy's figures are exact and others' are not."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +52,17 @@ class Comparison(Carded):
     Attributes:
         policies: in the order given; differences are to the first.
         tracks: held-out tracks that the figures are means over; None where they are exact.
+        units: the words for these; of several targets groups of tracks, or simulated episodes.
     """
 
     policies: tuple[Compared, ...]
     tracks: int | None
+    units: str = "held-out tracks"
+
+    @property
+    def about(self) -> str:
+        """What the figures are means over."""
+        return "exact" if self.tracks is None else f"{self.tracks:,} {self.units}"
 
     def card(self) -> Card:
         """A line for each policy; differences are to the first."""
@@ -58,8 +71,7 @@ class Comparison(Carded):
             aihtr, accuracy, sensors, difference = self.cells(each)
             last = "" if each is self.policies[0] else f"; Δ {difference}"
             facts[each.name] = f"AIHTR {aihtr}, {accuracy}, {sensors} sensors{last}"
-        about = "exact" if self.tracks is None else f"{self.tracks} held-out tracks"
-        head = f"Comparison: {len(self.policies)} policies, {about}; Δ: AIHTR less the first's"
+        head = f"Comparison: {len(self.policies)} policies, {self.about}; Δ: AIHTR less the first's"
         return Card(head, facts)
 
     def cells(self, row: Compared) -> list[str]:
@@ -72,7 +84,9 @@ class Comparison(Carded):
     def sentences(self) -> list[str]:
         """The conclusion for each policy but the first."""
         first, *others = self.policies
-        return [_sentence(first, each, exact=self.tracks is None) for each in others]
+        exact = self.tracks is None
+        unit = "episode" if exact or self.units != "held-out tracks" else "track"
+        return [_sentence(first, each, unit, exact=exact) for each in others]
 
 
 def _with_interval(found: MeanInterval) -> str:
@@ -81,9 +95,9 @@ def _with_interval(found: MeanInterval) -> str:
     return f"{decimal(found.mean)} ({decimal(found.low)} ... {decimal(found.high)})"
 
 
-def _sentence(first: Compared, other: Compared, *, exact: bool) -> str:
+def _sentence(first: Compared, other: Compared, unit: str, *, exact: bool) -> str:
     """The difference of a policy to the first, and whether it is shown."""
-    found, unit = other.difference, "episode" if exact else "track"
+    found = other.difference
     more = f"{decimal(abs(found.mean))} {'more' if found.mean > 0 else 'less'} per {unit}"
     if exact and abs(found.mean) <= _SAME * max(abs(first.figures["aihtr"].mean), 1.0):
         return f"{other.name} earns the same as {first.name} (exact)."
@@ -91,7 +105,7 @@ def _sentence(first: Compared, other: Compared, *, exact: bool) -> str:
         return f"{other.name} earns {more} than {first.name} (exact)."
     if found.low is None or found.high is None:
         return (
-            f"{other.name} earns {more} than {first.name}; the tracks are too few for an interval."
+            f"{other.name} earns {more} than {first.name}; the {unit}s are too few for an interval."
         )
     interval = f"95 % interval of the difference: {decimal(found.low)} to {decimal(found.high)}"
     if found.low <= 0.0 <= found.high:
@@ -99,11 +113,14 @@ def _sentence(first: Compared, other: Compared, *, exact: bool) -> str:
     return f"{other.name} earns {more} than {first.name}; {interval}."
 
 
-def compare(problem: Problem, policies: Mapping[str, Any] | Sequence[Any]) -> Comparison:
+def compare(problem: Subject, policies: Mapping[str, Any] | Sequence[Any]) -> Comparison:
     """Value policies on one problem: exactly on a world, paired over the held-out tracks on recorded ones.
 
+    Of several targets differences are paired as well: over simulated episodes with the same targets, as many as the
+    first policy's reward per step needs to be known to .005, or over groups of held-out tracks.
+
     Args:
-        problem: a world or recorded tracks.
+        problem: a world, recorded tracks, or a `Group` of targets.
         policies: name -> policy, or a list; each as for `tm.evaluate`, or the name of a baseline.
 
     Raises:
@@ -115,10 +132,15 @@ def compare(problem: Problem, policies: Mapping[str, Any] | Sequence[Any]) -> Co
         >>> compare(world, ["all_on", Policy.none(world)]).sentences
         ['Policy 2 earns 1,071.000 more per episode than all_on (exact).']
     """
-    check_problem(problem, "compare")
+    if not isinstance(problem, Group):
+        check_problem(problem, "compare")
     named = policies if isinstance(policies, Mapping) else _named(policies)
     if len(named) < 2:
         raise UserError(f"compare: {len(named)} policies, expected at least two")
+    if isinstance(problem, Group):
+        return _of_group(
+            problem, {name: _rule(problem, name, each) for name, each in named.items()}
+        )
     tables = {name: _table(problem, name, policy) for name, policy in named.items()}
     if isinstance(problem, Recorded):
         return _on_tracks(problem, tables)
@@ -147,6 +169,33 @@ def _on_tracks(problem: Recorded, tables: Mapping[str, Policy]) -> Comparison:
             Compared(name, {key: figures[key] for key in FIGURES}, ratio(reward - first, count))
         )
     return Comparison(tuple(rows), len(tracks))
+
+
+def _of_group(group: Group, rules: Mapping[str, Rule]) -> Comparison:
+    """Figures of policies for several targets; the same targets for all of them."""
+    found = {name: evaluate_group(rule) for name, rule in rules.items()}
+    first, *_ = found.values()
+    if not (exact := all(each.exact for each in found.values())) and group.recorded is None:
+        # No more than the first needs, so that episodes are the same for all.
+        count = len(first.totals) if not first.exact else _PLAYED
+        found = {name: evaluate_group(rule, episodes=count) for name, rule in rules.items()}
+        first, *_ = found.values()
+    rows = tuple(
+        Compared(name, {key: getattr(each, key) for key in FIGURES}, each.less(first).aihtr)
+        for name, each in found.items()
+    )
+    units = "simulated episodes" if group.recorded is None else "groups of held-out tracks"
+    return Comparison(rows, None if exact else len(first.totals), units)
+
+
+def _rule(group: Group, name: str, policy: Any) -> Rule:
+    """The policy for several targets."""
+    try:
+        if policy == "qmdp" and group.recorded is not None:
+            policy = estimated_qmdp(group.recorded)
+        return group_rule(group, policy)
+    except UserError as error:
+        raise UserError(f"compare: {name}: {error}") from error
 
 
 def _exact(value: float) -> MeanInterval:

@@ -8,12 +8,15 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from tensordict.nn import TensorDictModuleBase
 
+from trackmdp.algos.common import make_algorithm
+from trackmdp.config import TrainConfig
 from trackmdp.config.roots import OptimalBoundConfig
 from trackmdp.policies.policy import Policy, actor_table
-from trackmdp.seeding import derive
+from trackmdp.seeding import derive, preserved_global_rng
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation, regret_per_step
@@ -68,6 +71,23 @@ def learned_policy(
     if isinstance(subject, Group):
         return JointRule(subject, actor, device)
     return actor_table(subject.task, actor, device=device, check=check)
+
+
+def joint_policy(
+    cfg: TrainConfig, group: Group, arrays: Mapping[str, npt.NDArray[Any]]
+) -> JointRule:
+    """The policy of a run with these options and weights (`JointRule.packed`).
+
+    Raises:
+        RuntimeError: the weights are of other networks.
+    """
+    device = torch.device("cpu")
+    with preserved_global_rng():
+        algorithm = make_algorithm(cfg, group.task, device, targets=group.targets)
+    weights = {name: torch.from_numpy(part) for name, part in arrays.items() if name != "targets"}
+    actor: Any = algorithm.actor
+    actor.load_state_dict(weights)
+    return JointRule(group, actor, device)
 
 
 def means(found: GroupEvaluation) -> Evaluation:

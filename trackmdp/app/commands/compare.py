@@ -9,22 +9,26 @@ from typing import Any
 
 import torch
 
-from trackmdp.config import CompareConfig
+from trackmdp.config import CompareConfig, load_run_config
 from trackmdp.durable import write_json
 from trackmdp.training.compare import Comparison, compare
 from trackmdp.training.display import make_console, table
-from trackmdp.training.run import trained_alone
+from trackmdp.training.run import trained
+from trackmdp.world.group import Group, Subject, group_of
 from trackmdp.world.problem_file import problem_digest
-from trackmdp.world.tracks import Problem
 
 
-def run(cfg: CompareConfig, folder: Path, problem: Problem) -> float:
+def run(cfg: CompareConfig, folder: Path, problem: Subject) -> float:
     """Write `comparison.json`, and print the table and its conclusion; returns the number of policies.
 
-    The problem is the first run's; without one, `cfg`'s.
+    The problem is the first run's; without one, `cfg`'s. Where a run learned for several targets, all policies are
+    compared for as many.
     """
     console, policies = make_console(cfg.quiet), dict[str, Any]()
-    found = [trained_alone(each, torch.device("cpu")) for each in cfg.runs or []]
+    found = [trained(each, torch.device("cpu")) for each in cfg.runs or []]
+    count = max((load_run_config(each).targets.count for each in cfg.runs or []), default=1)
+    if count > 1:
+        found = [(group_of(own, count), *rest) for own, *rest in found]
     if found:
         problem = found[0][0]
     same = Counter(Path(each).name for each in cfg.runs or [])
@@ -35,7 +39,7 @@ def run(cfg: CompareConfig, folder: Path, problem: Problem) -> float:
     policies |= {name: name for name in cfg.baselines or []}
     compared = compare(problem, policies)
     write_json(folder / "comparison.json", _report(compared))
-    about = "exact" if compared.tracks is None else f"{compared.tracks} held-out tracks, 95 %"
+    about = compared.about + (", 95 %" if compared.tracks is not None else "")
     heads = ["policy", "AIHTR", "accuracy", "sensors per step", "AIHTR less the first"]
     rows = [[each.name, *compared.cells(each)] for each in compared.policies]
     console.print(table(about, heads, rows))
@@ -45,8 +49,10 @@ def run(cfg: CompareConfig, folder: Path, problem: Problem) -> float:
     return float(len(rows))
 
 
-def _digest(problem: Problem) -> str:
+def _digest(problem: Subject) -> str:
     """The digest of a problem, for policies of any memory."""
+    if isinstance(problem, Group):
+        return problem_digest(problem)
     return problem_digest(replace(problem, memory="cell", clip=2))
 
 
