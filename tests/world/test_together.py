@@ -286,6 +286,11 @@ def test_tracks_of_several_targets_from_a_file(tmp_path: Path) -> None:
             tm.load_tracks(file, 3, targets=wrong)  # type: ignore[call-overload]
     with pytest.raises(UserError, match=r"task.memory=displacement: expected cell"):
         tm.load_tracks(file, 3, targets=2, memory="displacement")
+    with pytest.raises(UserError, match=r"solver=optimal: needs a motion model"):
+        tm.solve(targets)
+    budgeted = tm.load_tracks(file, 3, targets=2, budget=1)
+    assert isinstance(budgeted, Group)
+    assert budgeted.task.budget == 1
 
 
 APART30 = by_hand(*(np.random.default_rng(k).integers(9, size=6).tolist() for k in range(30)))
