@@ -140,6 +140,7 @@ def solve_group(
     partition: SweptPartitionConfig | None = None,
 ) -> GroupSolution:
     """Plans of single targets by a config's solver, and the bound for all of them together."""
+    modelled(group.single, f"solver={choice.name}")
     started = time.monotonic()
     singles = tuple(run_solver(world, choice, on_progress, partition) for world in group.kinds)
     upper = upper_bound(group)
