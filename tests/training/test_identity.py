@@ -182,6 +182,8 @@ def test_what_another_run_left_is_not_taken(
         {"collector": {"environment": {"rows": {}, "generators": {}}}},
         {"random": {}},
         {"callbacks": {"csv": {"position": 10**15}}},
+        {"callbacks": [1]},
+        {"position": {"iteration": 8, "frames": 2000, "steps": 3}},
         {"callbacks": {"checkpoints": {"best": "x"}}},
     ],
 )
