@@ -8,12 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias, cast, overload
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from tensordict import TensorDict
 
 from trackmdp.episodes.belief_filter import beliefs
 from trackmdp.episodes.episode import Episode, Floats, Integers, last_cells
@@ -55,7 +54,7 @@ class Simulation:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Episodes(Showing, Sequence[Episode]):
+class Episodes(Showing[Episode]):
     """The episodes of one policy, all their steps end to end; a sequence of `Episode`.
 
     Attributes:
@@ -115,18 +114,6 @@ class Episodes(Showing, Sequence[Episode]):
         return cls(
             problem, policy, list(seeds), first=first, bits=columns.pop("bits", None), **columns
         )
-
-    def __len__(self) -> int:
-        return len(self.seeds)
-
-    @overload
-    def __getitem__(self, which: int) -> Episode: ...
-    @overload
-    def __getitem__(self, which: slice) -> list[Episode]: ...
-    def __getitem__(self, which: int | slice) -> Episode | list[Episode]:
-        if isinstance(which, slice):
-            return [self._episode(number) for number in range(len(self))[which]]
-        return self._episode(range(len(self))[which])
 
     @property
     def nbytes(self) -> int:
@@ -213,19 +200,14 @@ class Episodes(Showing, Sequence[Episode]):
         )
         return _summary(totals)
 
-    def complete(self) -> Iterator[Episode]:
-        """The episodes with `belief` and `probability`, computed for a bounded number of them at a time.
-
-        Recorded tracks have no motion model; their belief is 0 in all cells.
-        """
+    @property
+    def _at_once(self) -> int:
         world = self.problem.model
         states = self.problem.num_cells if world is None else world.num_states
-        at_once = max(1, min(256, _BELIEF // states))
-        for begin in range(0, len(self), at_once):
-            yield from self._completed(self[begin : begin + at_once])
+        return max(1, min(256, _BELIEF // states))
 
-    def _completed(self, some: Sequence[Episode]) -> Iterator[Episode]:
-        """See `complete`."""
+    def _completed(self, begin: int, end: int) -> Iterator[Episode]:
+        some = self[begin:end]
         check_layers(sum(map(len, some)), self.problem.num_cells)
         if (world := self.problem.model) is None:
             found = [np.zeros((len(each), self.problem.num_cells), np.float32) for each in some]
@@ -233,20 +215,6 @@ class Episodes(Showing, Sequence[Episode]):
             found = beliefs(world, some)
         for episode, belief in zip(some, found, strict=True):
             yield replace(episode, belief=belief, probability=self._probability(episode))
-
-    def to_tensordict(self) -> TensorDict:
-        """`[S]` the steps of all episodes, as of `Episode.to_tensordict`, and the number of each, `episode`."""
-        parts = [
-            each.to_tensordict(self.problem).set("episode", torch.full((len(each),), number))
-            for number, each in enumerate(self)
-        ]
-        return cast(TensorDict, torch.cat(parts)) if parts else TensorDict({}, [0])
-
-    def shown(self, call: str, number: int) -> Episode:
-        """See `Showing`."""
-        self.check(call, number)
-        (episode,) = self._completed([self[number]])
-        return episode
 
     def _probability(self, episode: Episode) -> Floats:
         if self.policy is None:

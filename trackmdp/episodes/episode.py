@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 from tensordict import TensorDict
 
-from trackmdp.notebook.card import Card, Carded, decimal
+from trackmdp.notebook.card import Card, Carded, Facts, decimal
 from trackmdp.world.model import BoolArray, Task
 from trackmdp.world.windows import Window
 
@@ -20,10 +20,25 @@ Floats: TypeAlias = npt.NDArray[np.float32]
 Integers: TypeAlias = npt.NDArray[np.int64]
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class Recording(Carded):
-    """What episodes of one target and of several have in common; see `Episode`.
+    """T steps of one target or of K. Row t is step t: state and action before the move, outcome after it.
 
     Attributes:
+        number: its place in the log.
+        seed: all its draws derive from it, so that it replays alone.
+        policy: which of the log's policies acted.
+        start: cell in which the target was located at the start; of K targets `[K]`, M of one that enters later.
+        misses: `[T]` n before the step; `[T, K]`, 0 once a target has left.
+        action: `[T, S]` sensors on; where the safe action is forced (n > t_max) it counts for nothing.
+        target: `[T]` the true cell after the move, M once exited; `[T, K]`, M also before a target enters.
+        located: `[T]` or `[T, K]` whether the target was located in that cell, as one that enters always is.
+        reward: `[T]` reward of the step, of all targets together.
+        terminated: the target, or the last one, exited in the last step.
+        truncated: the last step was the last one allowed.
+        belief: probability of each cell after the move, given all that was observed before it; None unless it was
+            asked for.
+        mode: `[T]` the target's mode after the move, -1 once exited; None where targets have none.
         first_tick: place of its first step on the log's time line; None until it is logged.
     """
 
@@ -37,7 +52,8 @@ class Recording(Carded):
     located: BoolArray
     reward: Floats
     terminated: bool
-    truncated: bool
+    truncated: bool = False
+    belief: Any = None
     mode: Integers | None = None
     first_tick: int | None = None
 
@@ -84,55 +100,56 @@ class Recording(Carded):
         """`[M]` how many targets were expected in each cell at step `t`; 0 where beliefs were not asked for."""
         raise NotImplementedError
 
+    def to_tensordict(self, task: Task) -> TensorDict:
+        """`[T]` steps under the keys of `TrackEnv`, as a rollout has them: the outcome of each step under `next`.
+
+        As in a rollout the true cell is not among them; it is `target`. With `max_steps` there is a `step_count`.
+        """
+        raise NotImplementedError
+
+    def _card(self, facts: Facts, located: str) -> Card:
+        """A card that begins with `facts`."""
+        facts |= {"return": decimal(float(self.returns[-1])), "located": located}
+        facts["sensors per step"] = decimal(float(self.action.sum(1).mean()))
+        return Card(f"Episode: number {self.number}, seed {self.seed}", facts)
+
+    def _transitions(
+        self, task: Task, states: dict[str, npt.NDArray[Any]], action: BoolArray
+    ) -> TensorDict:
+        """See `to_tensordict`; of the T + 1 `states` the last has no action, and the first is no outcome."""
+        if task.max_steps:
+            states["step_count"] = np.arange(len(self) + 1)
+        current = {key: value[:-1] for key, value in states.items()}
+        following = {key: value[1:] for key, value in states.items()}
+        following["reward"] = self.reward[:, None]
+        for part, terminated, truncated in (
+            (current, False, False),
+            (following, self.terminated, self.truncated),
+        ):
+            part |= ends(len(self), terminated, truncated)
+        return TensorDict({**current, "action": action, "next": following}, [len(self)])
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Episode(Recording):
-    """T steps of one target. Row t is step t: state and action before the move, outcome after it.
+    """Steps of one target; see `Recording`.
 
     Attributes:
-        number: its place in the log.
-        seed: all its draws derive from it, so that it replays alone.
-        policy: which of the log's policies acted.
-        start: cell in which the target was located at the start.
-        misses: `[T]` n before the step.
-        action: `[T, S]` sensors on; where the safe action is forced (n > t_max) it counts for nothing.
-        target: `[T]` the true cell after the move, M once exited.
-        located: `[T]` whether the target was located in that cell.
-        reward: `[T]` reward of the step.
-        terminated: the target exited in the last step.
-        truncated: the last step was the last one allowed.
-        belief: `[T, M]` probability of each cell after the move, given all that was observed before it; a row sums to
-            the probability of no exit. None unless it was asked for.
+        belief: `[T, M]`; a row sums to the probability of no exit.
         probability: `[T, M]` with which the policy sensed each cell. None unless it was asked for.
-        mode: `[T]` the target's mode after the move, -1 once exited; None where targets have none.
-        start_mode: its mode at the start; 0 where targets have none.
+        start_mode: the target's mode at the start; 0 where targets have none.
     """
 
-    number: int
-    seed: int
-    policy: int
     start: int
-    misses: Integers
-    action: BoolArray
-    target: Integers
-    located: BoolArray
-    reward: Floats
-    terminated: bool
-    truncated: bool
     belief: Floats | None = None
     probability: Floats | None = None
-    mode: Integers | None = None
     start_mode: int = 0
-    first_tick: int | None = field(default=None)
 
     def card(self) -> Card:
         """Length, return, detections and end."""
         end = "the target exited" if self.terminated else "truncated"
         facts = {"steps": f"{len(self):,}; {end}", "start": f"cell {self.start}"}
-        facts["return"] = decimal(float(self.returns[-1]))
-        facts["located"] = f"in {int(self.located.sum()):,} steps"
-        facts["sensors per step"] = decimal(float(self.action.sum(1).mean()))
-        return Card(f"Episode: number {self.number}, seed {self.seed}", facts)
+        return self._card(facts, f"in {int(self.located.sum()):,} steps")
 
     @property
     def complete(self) -> bool:
@@ -148,20 +165,12 @@ class Episode(Recording):
         return np.zeros(cells) if self.belief is None else self.belief[t]
 
     def to_tensordict(self, task: Task) -> TensorDict:
-        """`[T]` steps under the keys of `TrackEnv`, as a rollout has them: the outcome of each step under `next`.
-
-        As in a rollout the true cell is not among them; it is `target`.
-
-        Args:
-            task: of the world; with a window actions are in its local numbers, as the environment takes them, and with
-                `max_steps` there is a `step_count`.
-        """
+        """See `Recording`; with a window actions are in its local numbers, as the environment takes them."""
         action = (
             Window.of(task)
             .to_local(torch.from_numpy(self.last_cell), torch.from_numpy(self.action))
             .numpy()
         )
-        # The T + 1 states: each but the last has an action, each but the first is an outcome.
         over = self.located[-1] or self.terminated
         misses = np.append(self.misses, 0 if over else min(self.misses[-1] + 1, task.t_max + 1))
         states = {
@@ -169,16 +178,7 @@ class Episode(Recording):
             "steps_since_detection": misses,
             "action_history": _history(action, misses, self.located, task.t_max),
         }
-        if task.max_steps:
-            states["step_count"] = np.arange(len(self) + 1)
-        current = {key: value[:-1] for key, value in states.items()}
-        current |= {"action": action, **ends(len(self), terminated=False, truncated=False)}
-        following = {key: value[1:] for key, value in states.items()}
-        following |= {
-            "reward": self.reward[:, None],
-            **ends(len(self), self.terminated, self.truncated),
-        }
-        return TensorDict({**current, "next": following}, [len(self)])
+        return self._transitions(task, states, action)
 
 
 def _history(action: BoolArray, misses: Integers, located: BoolArray, t_max: int) -> BoolArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,54 +11,27 @@ import numpy.typing as npt
 from scipy import sparse
 from tensordict import TensorDict
 
-from trackmdp.episodes.episode import Episode, Floats, Integers, Recording, ends
-from trackmdp.notebook.card import Card, decimal
+from trackmdp.episodes.episode import Episode, Integers, Recording
+from trackmdp.notebook.card import Card
 from trackmdp.world.model import BoolArray, Task
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GroupEpisode(Recording):
-    """T steps of K targets that share the sensors. Row t is step t, as of `Episode`; column k is target k.
+    """Steps of K targets that share the sensors, column k of target k; see `Recording`.
 
     Attributes:
-        number: its place in the log.
-        seed: all its draws derive from it, so that it replays alone.
-        policy: which of the log's policies acted.
-        start: `[K]` cells in which the targets were located at the start; M of one that enters later.
-        misses: `[T, K]` n before the step, 0 once the target has left.
-        action: `[T, S]` sensors on; none where the safe action is forced.
-        target: `[T, K]` the true cells after the move, M before a target enters and once it has left the grid.
-        located: `[T, K]` whether the target was located in that cell, as one that enters always is.
-        reward: `[T]` reward of all targets together.
-        terminated: the last target left in the last step.
-        truncated: the last step was the last one allowed.
-        belief: `[T · K, M]` sparse: row t · K + k has the probability of each cell for target k after the move, given
-            all that was observed before it; a row sums to the probability that it has not left. None unless it was
-            asked for.
+        belief: `[T · K, M]` sparse: row t · K + k is of target k; it sums to the probability that it has not left.
     """
 
-    number: int
-    seed: int
-    policy: int
     start: Integers
-    misses: Integers
-    action: BoolArray
-    target: Integers
-    located: BoolArray
-    reward: Floats
-    terminated: bool
-    truncated: bool = False
     belief: sparse.csr_array | None = None
-    first_tick: int | None = field(default=None)
 
     def card(self) -> Card:
         """Length, return, detections and end."""
         end = "all targets exited" if self.terminated else "truncated"
         facts = {"targets": str(len(self.start)), "steps": f"{len(self):,}; {end}"}
-        facts["return"] = decimal(float(self.returns[-1]))
-        facts["located"] = f"{int(self.located.sum()):,} times"
-        facts["sensors per step"] = decimal(float(self.action.sum(1).mean()))
-        return Card(f"Episode: number {self.number}, seed {self.seed}", facts)
+        return self._card(facts, f"{int(self.located.sum()):,} times")
 
     @property
     def complete(self) -> bool:
@@ -68,21 +41,13 @@ class GroupEpisode(Recording):
     def singles(self) -> Iterator[Episode]:
         """See `Recording`."""
         targets = len(self.start)
+        shared = ("number", "seed", "policy", "action", "reward", "terminated", "truncated")
         for k in range(targets):
-            belief = None if self.belief is None else self.belief[k::targets].toarray()
             yield Episode(
-                number=self.number,
-                seed=self.seed,
-                policy=self.policy,
+                **{name: getattr(self, name) for name in shared},
+                **{name: getattr(self, name)[:, k] for name in ("misses", "target", "located")},
                 start=int(self.start[k]),
-                misses=self.misses[:, k],
-                action=self.action,
-                target=self.target[:, k],
-                located=self.located[:, k],
-                reward=self.reward,
-                terminated=self.terminated,
-                truncated=self.truncated,
-                belief=belief,
+                belief=None if self.belief is None else self.belief[k::targets].toarray(),
                 probability=self.action.astype(np.float32),
             )
 
@@ -94,11 +59,9 @@ class GroupEpisode(Recording):
         return np.asarray(rows.sum(axis=0), dtype=np.float64)
 
     def to_tensordict(self, task: Task) -> TensorDict:
-        """`[T]` steps under the keys of `TrackEnv` for several targets, the outcome of each step under `next`."""
-        gone, seen = (
-            np.append(self.start[None], self.target, axis=0) >= task.num_cells,
-            self.located,
-        )
+        """See `Recording`."""
+        gone = np.append(self.start[None], self.target, axis=0) >= task.num_cells
+        seen = self.located
         misses = np.append(self.misses, np.where(seen[-1] | gone[-1], 0, self.misses[-1] + 1)[None])
         states: dict[str, npt.NDArray[Any]] = {
             "last_cell": np.where(self._last_cells < task.num_cells, self._last_cells, 0),
@@ -108,16 +71,7 @@ class GroupEpisode(Recording):
         }
         if not task.available.all():
             states["action_mask"] = np.broadcast_to(task.available, (len(gone), len(task.cost)))
-        if task.max_steps:
-            states["step_count"] = np.arange(len(gone))
-        current = {key: value[:-1] for key, value in states.items()}
-        current |= {"action": self.action, **ends(len(self), terminated=False, truncated=False)}
-        following = {key: value[1:] for key, value in states.items()}
-        following |= {
-            "reward": self.reward[:, None],
-            **ends(len(self), self.terminated, self.truncated),
-        }
-        return TensorDict({**current, "next": following}, [len(self)])
+        return self._transitions(task, states, self.action)
 
     def _history(self, t_max: int) -> BoolArray:
         """`[T + 1, t_max + 1, S]` last actions in each state, the latest first; none from before a safe action."""

@@ -5,11 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import cast, overload
 
 import numpy as np
-import torch
-from tensordict import TensorDict
 
 from trackmdp.episodes.group_episode import GroupEpisode
 from trackmdp.episodes.group_simulate import AT_ONCE, group_episodes
@@ -25,7 +22,7 @@ _BELIEFS = 2**22
 """Numbers of the beliefs that are kept together, at most, if a target may be in 30 cells in each of 100 steps."""
 
 
-class GroupEpisodes(Showing, Sequence[GroupEpisode]):
+class GroupEpisodes(Showing[GroupEpisode]):
     """The episodes of one policy for several targets; a sequence of `GroupEpisode`.
 
     Args:
@@ -45,15 +42,8 @@ class GroupEpisodes(Showing, Sequence[GroupEpisode]):
     def _made(self) -> list[GroupEpisode]:
         return [*_numbered(group_episodes(self.policy, self.seeds), 0)]
 
-    def __len__(self) -> int:
-        return len(self.seeds)
-
-    @overload
-    def __getitem__(self, which: int) -> GroupEpisode: ...
-    @overload
-    def __getitem__(self, which: slice) -> list[GroupEpisode]: ...
-    def __getitem__(self, which: int | slice) -> GroupEpisode | list[GroupEpisode]:
-        return self._made[which]
+    def _episode(self, number: int) -> GroupEpisode:
+        return self._made[number]
 
     @property
     def nbytes(self) -> int:
@@ -102,26 +92,13 @@ class GroupEpisodes(Showing, Sequence[GroupEpisode]):
             float(known.sum()),
         ]
 
-    def complete(self) -> Iterator[GroupEpisode]:
-        """The episodes with `belief`, simulated once more, a bounded number of them at a time."""
-        each = max(1, min(AT_ONCE, _BELIEFS // 3000) // len(self.problem))
-        for begin in range(0, len(self), each):
-            seeds = self.seeds[begin : begin + each]
-            yield from _numbered(group_episodes(self.policy, seeds, beliefs=True), begin)
+    @property
+    def _at_once(self) -> int:
+        return max(1, min(AT_ONCE, _BELIEFS // 3000) // len(self.problem))
 
-    def shown(self, call: str, number: int) -> GroupEpisode:
-        """See `Showing`."""
-        self.check(call, number)
-        (episode,) = group_episodes(self.policy, self.seeds[number : number + 1], beliefs=True)
-        return replace(episode, number=number)
-
-    def to_tensordict(self) -> TensorDict:
-        """`[S]` the steps of all episodes, as of `GroupEpisode.to_tensordict`, and the number of each, `episode`."""
-        parts = [
-            each.to_tensordict(self.problem.task).set("episode", torch.full((len(each),), number))
-            for number, each in enumerate(self)
-        ]
-        return cast(TensorDict, torch.cat(parts)) if parts else TensorDict({}, [0])
+    def _completed(self, begin: int, end: int) -> Iterator[GroupEpisode]:
+        """Simulated once more."""
+        return _numbered(group_episodes(self.policy, self.seeds[begin:end], beliefs=True), begin)
 
 
 def _numbered(episodes: Sequence[GroupEpisode], begin: int) -> Iterator[GroupEpisode]:

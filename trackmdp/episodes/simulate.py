@@ -6,7 +6,7 @@ The log, the web page, the picture and the simulated figures of an evaluation ar
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, cast, overload
+from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -91,7 +91,7 @@ def simulate(
         policy = named_policy(problem, policy)
 
     def first(count: int) -> Any:
-        return resimulate(cast(Any, problem), policy, episode_seeds(seed, count, *names))
+        return resimulate(problem, policy, episode_seeds(seed, count, *names))
 
     if episodes > _MANY:
         tried = first(_TRIED)
@@ -112,19 +112,14 @@ def episode_seeds(seed: int, episodes: int, *names: str | int) -> list[int]:
     return [derive(seed, "episode", *names, number) for number in range(episodes)]
 
 
-@overload
-def resimulate(
-    problem: Problem, policy: PolicyLike | Playback, seeds: Sequence[int]
-) -> Episodes: ...
-@overload
-def resimulate(problem: Group, policy: Rule, seeds: Sequence[int]) -> GroupEpisodes: ...
-
-
 @torch.no_grad()
 def resimulate(
     problem: Problem | Group, policy: PolicyLike | Playback | Rule, seeds: Sequence[int]
-) -> Episodes | GroupEpisodes:
-    """One episode for each of `seeds`, in their order; each independent of the others. See `simulate`."""
+) -> Any:
+    """`Episodes` or `GroupEpisodes`: one episode for each of `seeds`, in their order, each independent of the others.
+
+    See `simulate`.
+    """
     if isinstance(policy, Rule):
         return GroupEpisodes(policy, seeds)
     assert not isinstance(problem, Group)
