@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -63,7 +63,7 @@ class SetTable:
         """`[E]` probability that `sensors` `[E]` are on, after n misses in each plan `[E]`."""
         if self.sets is None:
             return np.full(len(plans), float(self.probability or 0.0))
-        return _looked_up(self._sets, self.task.num_choices, n, plans, sensors)
+        return self._looked_up(self.sets, n, plans, sensors)
 
     def reports(self, n: int, plans: npt.NDArray[Any], cells: npt.NDArray[Any]) -> Array:
         """`[E]` probability that a target in `cells` `[E]` is reported after n misses in each plan."""
@@ -72,7 +72,18 @@ class SetTable:
             return self.chosen(n, plans, cells) * task.detects(cells)
         if self.sets is None:
             return self._share[cells]
-        return _looked_up(self._reports, task.num_choices, n, plans, cells)
+        return self._looked_up(self.reporting, n, plans, cells)
+
+    def _looked_up(
+        self, table: sparse.csr_array, n: int, plans: npt.NDArray[Any], columns: npt.NDArray[Any]
+    ) -> Array:
+        """`[E]`, the entries of row plan (t_max + 1) + n of a table in `columns`."""
+        found = np.empty(len(columns))
+        for begin in range(0, len(columns), _AT_ONCE):
+            part = slice(begin, begin + _AT_ONCE)
+            row = np.asarray(plans[part], dtype=np.int64) * self.task.num_choices + n
+            found[part] = table[row, columns[part]]
+        return found
 
     def spent(self, n: int, price: Array) -> Array:
         """`[plans]` expected price of the sensors on after n misses; `price` `[S]` is per sensor."""
@@ -127,14 +138,6 @@ class SetTable:
     def _covers(self) -> sparse.csr_array:
         """`[M, S]` 1.0 where a sensor covers a cell."""
         return sparse.csr_array(self.task.sees_by_cell > 0, dtype=np.float64)
-
-    @cached_property
-    def _sets(self) -> Entries:
-        return _entries(self.sets)
-
-    @cached_property
-    def _reports(self) -> Entries:
-        return _entries(self.reporting)
 
 
 class PolicyTable(Carded, SetTable):
@@ -376,38 +379,3 @@ def _choosable_sets(task: Task, probability: float) -> sparse.csr_array:
     near.eliminate_zeros()
     near = short_indices(sparse.csr_array(near, dtype=np.float64 if probability < 1 else np.bool_))
     return near[np.repeat(np.arange(task.num_cells), task.keys.num_classes * task.num_choices)]
-
-
-class Entries(NamedTuple):
-    """The entries of a table for look-up.
-
-    Attributes:
-        numbers: `[nnz + 1]` sorted numbers r · columns + j of the entries, closed by the largest int64 as a sentinel.
-        values: `[nnz + 1]`, bool or float64, of the sentinel 0.
-        columns: of the table.
-    """
-
-    numbers: npt.NDArray[np.int64]
-    values: npt.NDArray[Any]
-    columns: int
-
-
-def _entries(table: sparse.csr_array) -> Entries:
-    row = np.repeat(np.arange(table.shape[0], dtype=np.int64), np.diff(table.indptr))
-    numbers = np.append(row * table.shape[1] + table.indices, np.iinfo(np.int64).max)
-    return Entries(numbers, np.append(table.data, table.dtype.type(0)), table.shape[1])
-
-
-def _looked_up(
-    table: Entries, choices: int, n: int, keys: npt.NDArray[Any], columns: npt.NDArray[Any]
-) -> Array:
-    """`[E]`, the entries of row key (t_max + 1) + n in `columns`."""
-    # With 4 columns and t_max = 1: located in 2, after 1 miss, sensor 3 is entry (2 * 2 + 1) * 4 + 3 = 23.
-    found = np.empty(len(columns))
-    for begin in range(0, len(columns), _AT_ONCE):
-        part = slice(begin, begin + _AT_ONCE)
-        row = np.asarray(keys[part], dtype=np.int64) * choices + n
-        wanted = row * table.columns + columns[part]
-        place = np.searchsorted(table.numbers, wanted)
-        found[part] = np.where(table.numbers[place] == wanted, table.values[place], 0.0)
-    return found
