@@ -132,6 +132,18 @@ def test_targets_that_never_leave_are_followed_for_the_steps_allowed() -> None:
         evaluate(group, "none")
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_brute_force_is_below_the_bound_where_the_safe_action_is_cheap(seed: int) -> None:
+    # What one target's clock forces locates the others, at no detection of theirs.
+    rng = np.random.default_rng(seed)
+    given: dict[str, Any] = {"detection": rng.uniform(0.2, 0.9), "cost": rng.uniform(0.05, 1.0)}
+    given |= {"safe_cost": 0.1, "t_max": int(rng.integers(2)), "budget": [None, 1][seed % 2]}
+    world = World(np.array([[0.9]]), (1, 1), **given)
+    for count in (2, 3):
+        group = Group([world] * count)
+        assert best_of_all(group) <= upper_bound(group) + 1e-9
+
+
 def test_one_target_is_todays_world() -> None:
     for seed in range(4):
         world = random_tiny_world(np.random.default_rng(seed))

@@ -15,11 +15,11 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from trackmdp.solvers.bounds import clocked, clocked_table
+from trackmdp.solvers.bounds import clocked, clocked_table, valid
 from trackmdp.solvers.choose import summing
 from trackmdp.solvers.linear import expected_steps, row_index
 from trackmdp.world.group import Group
-from trackmdp.world.model import Array, World
+from trackmdp.world.model import Array, Task, World
 
 MOST_PAIRS = 2**16
 """Pairs of positions up to which shares depend on both: 256 cells."""
@@ -42,10 +42,21 @@ def upper_bound(group: Group) -> float:
 
 
 def equal_shares(group: Group) -> float:
-    """The sum of the clocked bounds of single targets that pay 1 / K of each price, the safe action's included."""
+    """The sum of the bounds of single targets that pay 1 / K of each price, the safe action's included.
+
+    Other targets may force the safe action at any time. The clocked bound, in which the own clock alone does, holds
+    where all sensors can take its place; else the valid bound does, which allows it in every step.
+    """
     cost, safe = group.task.cost / len(group), group.task.safe_cost / len(group)
-    values = [float(clocked(world.but(cost=cost, safe_cost=safe)).mean()) for world in group.kinds]
+    bound = clocked if sensors_suffice(group.task) else valid
+    values = [float(bound(world.but(cost=cost, safe_cost=safe)).mean()) for world in group.kinds]
     return sum(values[kind] for kind in group.kind)
+
+
+def sensors_suffice(task: Task) -> bool:
+    """Whether all sensors together do what the safe action does, are no dearer, and are allowed by the budget."""
+    dear = task.safe_cost >= float(np.nansum(task.cost)) * (1.0 - 1e-12)
+    return dear and task.perfect and bool(task.available.all()) and task.budget is None
 
 
 @dataclass(frozen=True, eq=False)

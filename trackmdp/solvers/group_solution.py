@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-
 from trackmdp.notebook.card import Card, Carded, decimal, grid_words
 from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.group_bounds import sensors_suffice
 from trackmdp.solvers.group_tracker import GroupTracker
 from trackmdp.solvers.merging import Merged
 from trackmdp.solvers.solution import Solution
@@ -58,10 +57,7 @@ class GroupSolution(Carded):
         All own sets together cost no more than `apart`, and a detection more loses nothing where all sensors can do
         what the safe action does, and are no dearer. None where they are or cannot, or a budget forbids the union.
         """
-        task = self.group.task
-        dear = task.safe_cost >= float(np.nansum(task.cost)) * (1.0 - 1e-12)
-        able = task.perfect and bool(task.available.all())
-        return self.apart if dear and able and task.budget is None else None
+        return self.apart if sensors_suffice(self.group.task) else None
 
     def card(self) -> Card:
         """The bracket."""
