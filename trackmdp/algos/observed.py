@@ -26,7 +26,7 @@ from trackmdp.world.windows import Window
 
 _ENDING = 8
 """Cells at the end of a path that identify its recording: wherever a path began, it ends as its recording."""
-_ROUNDS = 20
+EM_ROUNDS = 20
 """Rounds of expectation-maximisation, from the moves seen alone: the result does not depend on earlier ones."""
 
 
@@ -163,7 +163,7 @@ class SensedPaths:
         if not seen.all():
             estimate = KernelEstimate(task.size, weight=1.0, exit_weight=1.0, share_cells=None)
             estimate.add(paths)
-            estimate.fit(_ROUNDS)
+            estimate.fit(EM_ROUNDS)
             rng = np.random.default_rng(self._seed)
             line[~seen] = hidden_cells(estimate.mean(), paths, rng)
         track = np.repeat(np.cumsum(begins) - 1, np.diff(first))

@@ -9,9 +9,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from trackmdp.algos.common import arrays, tensors
+from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.estimates.path_plans import parted
-from trackmdp.algos.moves import MoveBuffer, cell_dtype
-from trackmdp.algos.observed import SensedPaths
+from trackmdp.algos.moves import CellIndex, MoveBuffer, cell_dtype
+from trackmdp.algos.observed import EM_ROUNDS, SensedPaths, observed_paths
+from trackmdp.solvers.linear import row_index
 from trackmdp.world.model import Task
 from trackmdp.world.tracks import Tracks
 
@@ -113,37 +116,59 @@ class SegmentBuffer:
 
 
 class InferredMoves(MoveBuffer):
-    """A `MoveBuffer` of the moves on whole paths, with unknown cells drawn; for cells that no sensor covers.
+    """A `MoveBuffer` of expected moves, given all paths from detection to detection; for cells that no sensor covers.
 
     Args:
-        task: its sensors.
+        task: its cells, or keys where a detection reveals the mode, and its sensors.
         generator: draws the paths; they come on its device.
     """
 
     def __init__(self, task: Task, generator: torch.Generator) -> None:
         super().__init__(task, 0, generator)
-        self._weights, self._paths = None, SensedPaths(task)
+        self._task, modes = task, task.keys.num_classes
+        # A mode that is revealed moves on its own; else cells are alike where the moves seen show no difference.
+        share = False if modes > 1 else None
+        self._estimate = KernelEstimate(
+            task.size, weight=1.0, exit_weight=1.0, share_cells=share, modes=modes
+        )
 
     def __len__(self) -> int:
-        return len(self._paths)
+        return len(self._estimate)
 
     def extend(self, batch: TensorDictBase) -> None:
         """Add the paths that end in a collected batch `[B, time]`, with any sensors on."""
-        self._paths.extend(batch)
+        self._estimate.add(observed_paths(batch.reshape(-1, batch.shape[-1]), self._task))
         self._index = None
 
     def moves(self) -> tuple[Tensor, Tensor]:
-        """Cells before and after every move, int64 `[K]` each."""
+        """Cells before and after every move that may have been made, int64 `[K]` each."""
+        self._index = self._index or self._sort()
+        counts, device = self._estimate.counts, self._generator.device
         start, end = (
-            torch.as_tensor(part, device=self._generator.device) for part in self._paths.moves()
+            torch.as_tensor(part, device=device).long()
+            for part in (row_index(counts), counts.indices)
         )
         return start, end
 
+    def _sort(self) -> tuple[Tensor, CellIndex]:
+        """All ends in the order of (start, end), and where those of each cell are, weighted by expected numbers."""
+        estimate, device = self._estimate, self._generator.device
+        # From the moves seen alone: the result does not depend on when it was asked for before.
+        estimate.counts = estimate.direct
+        estimate.fit(EM_ROUNDS)
+        estimate.counts.sort_indices()
+        start, end, weights = (
+            torch.as_tensor(part, device=device)
+            for part in (row_index(estimate.counts), estimate.counts.indices, estimate.counts.data)
+        )
+        ends = torch.cat([end.long(), end.new_tensor([self.num_cells]).long()])
+        return ends, CellIndex.of(start.long(), self.num_cells, weights)
+
     def state_dict(self) -> dict[str, Tensor]:
         """All that was observed; the generator is its owner's to save."""
-        return self._paths.state_dict()
+        return tensors(self._estimate.state())
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Continue from a `state_dict`."""
-        self._paths.load_state_dict(state)
+        self._estimate.load_state(arrays(state))
         self._index = None
