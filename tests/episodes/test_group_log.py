@@ -322,3 +322,16 @@ def test_commands_log_and_replay_several_targets(
     assert row["n"] == "0 0"
     layout = json.loads((tmp_path / "a" / "episodes.layout.json").read_text(encoding="utf-8"))
     assert "/belief/1" in layout["configById"]["3D!belief"]["topics"]
+
+
+def test_a_safe_action_that_misses_is_logged_and_found_again(tmp_path: Path) -> None:
+    world = tiny(5, t_max=1, safe_detection=np.array([0.3, 0.6, 1.0]), max_steps=9)
+    rule = make_rule(Group([world] * 2), [tm.Policy.none(world)], "union")
+    episodes = played(60, rule=rule)
+    with EpisodeReader(write(tmp_path / "a.mcap", episodes, rule)) as reader:
+        assert verify(reader).difference is None
+        steps = [reader[number]["next", "steps_since_detection"] for number in range(60)]
+    assert max(int(each.max()) for each in steps) == 2
+    repeated = [(np.diff(each.misses, axis=0) == 0) & (each.misses[1:] == 2) for each in episodes]
+    assert any(each.any() for each in repeated)
+    assert any(each.truncated and (each.misses[-1] == 2).any() for each in episodes)

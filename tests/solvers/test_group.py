@@ -144,6 +144,43 @@ def test_brute_force_is_below_the_bound_where_the_safe_action_is_cheap(seed: int
         assert best_of_all(group) <= upper_bound(group) + 1e-9
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_brute_force_lies_above_the_policies_where_the_safe_action_misses(seed: int) -> None:
+    # A clock may stand still for ever so long: beliefs go on all the while, so a target that does not move is taken.
+    rng = np.random.default_rng(seed)
+    given: dict[str, Any] = {"safe_detection": rng.uniform(0.3, 0.9), "cost": rng.uniform(0.1, 0.9)}
+    given |= {
+        "safe_cost": rng.uniform(0.5, 2.0),
+        "t_max": seed % 2,
+        "max_steps": [None, 6][seed // 2],
+    }
+    world = World(np.array([[0.8]]), (1, 1), detection=[1.0, 0.7][seed % 2], **given)
+    for count in (2, 3):
+        group = Group([world] * count)
+        best = best_of_all(group)
+        assert best <= upper_bound(group) + 1e-9
+        table = solve(world.but(max_steps=None)).table
+        for merge in ("gains", "union"):
+            rule = make_rule(group, [table], merge)
+            exact, played = evaluate_group(rule), evaluate_group(rule, episodes=4_000)
+            assert exact.exact
+            assert exact.aihtr.mean <= best + 1e-9
+            assert played.aihtr.low is not None
+            half = played.aihtr.mean - played.aihtr.low
+            assert abs(played.aihtr.mean - exact.aihtr.mean) < 2 * half + 1e-9
+
+
+def test_one_target_whose_safe_action_misses_is_todays_world() -> None:
+    world = tiny(2, t_max=1, safe_detection=np.array([0.5, 0.9, 0.7]), safe_cost=0.4)
+    table = solve(world).table
+    alone, group = evaluate(world, table), Group([world])
+    assert solve(group).lower is None
+    for merge in ("gains", "union"):
+        found = evaluate_group(make_rule(group, [table], merge), episodes=20_000)
+        assert found.aihtr.low is not None
+        assert abs(found.aihtr.mean - alone.aihtr) < 2 * (found.aihtr.mean - found.aihtr.low)
+
+
 def test_one_target_is_todays_world() -> None:
     for seed in range(4):
         world = random_tiny_world(np.random.default_rng(seed))

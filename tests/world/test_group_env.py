@@ -89,6 +89,31 @@ def test_union_earns_in_the_environment_what_the_joint_chain_says() -> None:
     assert error < 0.02 * abs(expected)
 
 
+def test_a_safe_action_that_misses_is_repeated() -> None:
+    env = TrackEnv(
+        two_kinds(safe_detection=0.4, safe_cost=1.5, exit_probability=0.01), 3000, seed=5
+    )
+    check_env_specs(env)
+    state, none = env.reset(), torch.zeros(3000, 9, dtype=torch.bool)
+    for step in range(4):
+        before, forced = state["steps_since_detection"], state["steps_since_detection"].amax(-1) > 1
+        state = env.step(state.set("action", none))["next"]
+        assert bool(forced.all()) == (step == 2)
+        n, inside = state["steps_since_detection"], state["present"]
+        missed = inside & (n > 0)
+        torch.testing.assert_close(n[missed], (before + 1).clamp_max(2)[missed])
+        paid = 1.5 * forced * inside.any(-1)
+        located = (inside & (n == 0)).sum(-1)
+        torch.testing.assert_close(state["reward"][:, 0], (located - paid).float())
+        found = located.sum() / inside.sum()
+        if step == 2:
+            assert abs(float(found) - 0.4) < 0.02
+        elif step < 2:
+            assert found == 0
+    # Where one clock of three stands at 2 all targets are looked for once more.
+    assert abs(float(forced.float().mean()) - (1 - 0.4**3)) < 0.02
+
+
 def test_episodes_are_cut_after_the_last_step_allowed() -> None:
     env = TrackEnv(two_kinds(max_steps=3, exit_probability=0.3), 500, seed=1)
     check_env_specs(env)

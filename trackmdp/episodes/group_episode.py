@@ -62,7 +62,8 @@ class GroupEpisode(Recording):
         """See `Recording`."""
         gone = np.append(self.start[None], self.target, axis=0) >= task.num_cells
         seen = self.located
-        misses = np.append(self.misses, np.where(seen[-1] | gone[-1], 0, self.misses[-1] + 1)[None])
+        more = np.minimum(self.misses[-1] + 1, task.t_max + 1)
+        misses = np.append(self.misses, np.where(seen[-1] | gone[-1], 0, more)[None])
         states: dict[str, npt.NDArray[Any]] = {
             "last_cell": np.where(self._last_cells < task.num_cells, self._last_cells, 0),
             "steps_since_detection": misses.reshape(gone.shape),

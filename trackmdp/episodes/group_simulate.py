@@ -51,7 +51,7 @@ class _Batch:
         targets = len(rule.group)
         # As with one target, moves and reports apart, so that two policies with one seed meet the same targets.
         self._moves, self._seen = Draws(seeds, self._move_draws), None
-        if not rule.task.perfect:
+        if not (rule.task.perfect and rule.task.safe):
             double = torch.float64
             self._seen = Draws(
                 seeds,
@@ -93,7 +93,7 @@ class _Batch:
         """One step of `TrackEnv`; the same order of events, the same arithmetic."""
         task, cells, paths = self._task, self._task.num_cells, self._paths
         moved = beliefs.moved(self._group)
-        late: BoolArray = np.any(clocks.present & (clocks.misses > task.t_max), axis=1)
+        late = clocks.late(task.t_max)
         on = self._rule.sets(clocks, moved)
         on = on[~late[on // cells]]
         action = np.zeros((self._shape[0], cells), dtype=bool)
@@ -104,12 +104,11 @@ class _Batch:
         inside, state = paths.inside(place).numpy(), paths.state(place).numpy()
         present = clocks.present & inside
         cell = np.where(inside, state % cells, 0)
-        report = np.take_along_axis(action, cell, axis=1)
+        seen = present & (np.take_along_axis(action, cell, axis=1) | late[:, None])
         if self._seen is not None:
-            chance = np.ones(self._shape)
-            chance[row] = self._seen.at(torch.from_numpy(row), step).numpy()
-            report &= chance < task.detection[cell]
-        seen = present & (report | late[:, None])
+            draw = np.ones(self._shape)
+            draw[row] = self._seen.at(torch.from_numpy(row), step).numpy()
+            seen &= draw < np.where(late[:, None], task.safe_detection[cell], task.detection[cell])
         reward = self._reward(action, seen, late, present)
         columns = {"misses": clocks.misses, "action": np.packbits(action, axis=1), "reward": reward}
         # A target that enters is located; it has no part in this step's reward.

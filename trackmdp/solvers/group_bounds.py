@@ -128,13 +128,19 @@ class _Paired:
         later = [np.asarray((self._stays @ table[:, :, n].T).T) for n in range(clocks)]
         detected = world.reward + later[0]
         half = np.append(np.full(self.other.num_cells, 0.5), 1.0)
-        safe = kernel @ detected - world.safe_cost * world.stay_probability[:, None] * half
-        found = [safe]
-        for n in reversed(range(clocks - 1)):
-            missed = later[n + 1][to]
+        charge = world.safe_cost * world.stay_probability[:, None] * half
+        found, sure = list[Array](), world.safe_detection[:, None]
+        for n in reversed(range(clocks)):
+            # Where the safe action misses as well, it is due in the next step.
+            lost = later[min(n + 1, clocks - 1)]
+            safe = kernel @ (sure * detected + (1.0 - sure) * lost) - charge
+            if n == clocks - 1:
+                found = [safe]
+                continue
+            missed = lost[to]
             over = world.detection[to, None] * (detected[to] - missed)
             gain = np.maximum(kernel.data[:, None] * over - self._prices, 0.0)
-            free = kernel @ later[n + 1] + self._sums @ gain
+            free = kernel @ lost + self._sums @ gain
             found.insert(0, np.maximum(free, safe))
         return np.stack(found, axis=2)
 

@@ -135,9 +135,8 @@ def _outcomes(group: Group, known: Known, on: set[int], forced: bool) -> list[Ou
     states, masses = (np.array(part) for part in zip(*belief, strict=True))
     moved = Beliefs(np.zeros(len(states), np.int64), states, masses).moved(group)
     cells = moved.state % task.num_cells
-    sees = np.array([forced or cell in on for cell in cells]) * (
-        1.0 if forced else task.detection[cells]
-    )
+    sees = np.array([cell in on for cell in cells]) * task.detection[cells]
+    sees = task.safe_detection[cells] if forced else sees
     found: list[Outcome] = [
         (float(p), True, (int(z), 0, ((int(z), 1.0),)))
         for p, z in zip(moved.mass * sees, moved.state, strict=True)
@@ -149,6 +148,6 @@ def _outcomes(group: Group, known: Known, on: set[int], forced: bool) -> list[Ou
         pairs = [
             (int(z), round(p / total, 12)) for z, p in zip(moved.state, left, strict=True) if p > 0
         ]
-        found.append((total, False, (located, misses + 1, tuple(pairs))))
+        found.append((total, False, (located, min(misses + 1, task.t_max + 1), tuple(pairs))))
     gone = 1.0 - float(moved.mass.sum())
     return [*found, (gone, False, None)] if gone > 1e-15 else found

@@ -55,9 +55,11 @@ class GroupSolution(Carded):
         """Proved: the best policy has no lower AIHTR.
 
         All own sets together cost no more than `apart`, and a detection more loses nothing where all sensors can do
-        what the safe action does, and are no dearer. None where they are or cannot, or a budget forbids the union.
+        what the safe action does, and are no dearer. None where they are or cannot, a budget forbids the union, or a
+        safe action that misses may take the place of sets that would not.
         """
-        return self.apart if sensors_suffice(self.group.task) else None
+        task = self.group.task
+        return self.apart if sensors_suffice(task) and task.safe else None
 
     def card(self) -> Card:
         """The bracket."""

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from trackmdp.errors import UserError
+from trackmdp.solvers.linear import IndexArray
 from trackmdp.solvers.merging import Beliefs, Clocks, Rule, switched_on
 from trackmdp.world.model import BoolArray
 
@@ -56,8 +57,7 @@ class GroupTracker:
     @property
     def safe(self) -> bool:
         """Whether the safe action is due, which locates all targets."""
-        late = self._clocks.misses > self._policy.task.t_max
-        return bool((late & self._clocks.present).any())
+        return bool(self._clocks.late(self._policy.task.t_max)[0])
 
     def sensors(self) -> list[int]:
         """The sensors to switch on in this step: all where the safe action is due, none once all targets have left."""
@@ -89,22 +89,23 @@ class GroupTracker:
         if not ((place >= 0) & (place < self._cells)).all():
             raise UserError(f"report({list(cells)}): expected cells from 0 to {self._cells - 1}")
         on, moved = np.array(self.sensors(), dtype=np.int64), self._beliefs.moved(self._group)
-        sees = switched_on(on, moved.state % self._cells) | self.safe
-        self._beliefs = self._left(moved, sees, present & ~seen, place, seen)
+        self._beliefs = self._left(moved, on, present & ~seen, place, seen)
         located = np.where(seen, place + self._group.kind * self._cells, before.located[0])
-        misses = np.where(seen, 0, before.misses[0] + 1)
-        history = before.remembered(on)
+        t_max = self._policy.task.t_max
+        misses = np.where(seen, 0, np.minimum(before.misses[0] + 1, t_max + 1))
+        history = before.remembered(on, before.late(t_max))
         self._clocks = Clocks(located[None], misses[None], present[None], history)
 
     def _left(
-        self, moved: Beliefs, sees: BoolArray, missed: BoolArray, place: np.ndarray, seen: BoolArray
+        self, moved: Beliefs, on: IndexArray, missed: BoolArray, place: np.ndarray, seen: BoolArray
     ) -> Beliefs:
         """Beliefs after the reports."""
-        task = self._policy.task
-        chance = np.asarray(sees * task.detects(moved.state % self._cells), dtype=np.float64)
+        task, cell = self._policy.task, moved.state % self._cells
+        free = switched_on(on, cell) * task.detects(cell)
+        chance = task.safe_detection[cell] if self.safe else free.astype(np.float64)
         possible = moved.given(missed, chance, len(missed))
         lost = np.setdiff1d(np.flatnonzero(missed), possible.row)
-        if len(lost):
+        if len(lost) and self._group.recorded is None:  # a track may make moves that no other made
             raise UserError(f"report: target {lost[0]} is missed where it would have been detected")
         again = np.flatnonzero(seen)
         found = Beliefs.at(again, place[again] + self._group.kind[again] * self._cells)

@@ -161,14 +161,16 @@ class _Batch:
         """One step with the sensors `on`; adds to the totals, and returns the beliefs after it."""
         task, clocks, shape = self.task, self.clocks, self.shape
         before = clocks.present
-        forced: BoolArray = np.any(before & (clocks.misses > task.t_max), axis=1)
+        forced = clocks.late(task.t_max)
         on = on[~forced[on // self.cells]]
         self.place, present = self._moved(before)
         episode = np.broadcast_to(np.arange(shape[0])[:, None], shape)
-        report = switched_on(on, episode * self.cells + self.place % self.cells)
-        if not task.perfect:
-            report &= self.reports.random(shape) < task.detection[self.place % self.cells]
-        seen = present & (report | forced[:, None])
+        cell = self.place % self.cells
+        report = switched_on(on, episode * self.cells + cell) | forced[:, None]
+        if not (task.perfect and task.safe):
+            chance = np.where(forced[:, None], task.safe_detection[cell], task.detection[cell])
+            report &= self.reports.random(shape) < chance
+        seen = present & report
         self._add(found, on, seen, present, before, forced)
         reports = self._followed(present, seen)
         self.clocks, beliefs = followed(self.group, clocks, moved, on, self.place, reports)

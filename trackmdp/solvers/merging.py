@@ -50,13 +50,18 @@ class Clocks:
     present: BoolArray
     history: BoolArray | None = None
 
-    def remembered(self, on: IndexArray) -> BoolArray | None:
-        """The history after a step with the sensors `on`, sorted numbers e · S + j."""
+    def late(self, t_max: int) -> BoolArray:
+        """`[E]`, whether the safe action is due."""
+        found: BoolArray = np.any(self.present & (self.misses > t_max), axis=1)
+        return found
+
+    def remembered(self, on: IndexArray, late: BoolArray) -> BoolArray | None:
+        """The history after a step with the sensors `on`, sorted numbers e · S + j; none after a safe action."""
         if self.history is None:
             return None
         latest = np.zeros_like(self.history[:, :1])
         latest.reshape(-1)[on] = True
-        return np.concatenate([latest, self.history[:, :-1]], axis=1)
+        return np.concatenate([latest, self.history[:, :-1]], axis=1) & ~late[:, None, None]
 
 
 Reports: TypeAlias = tuple[BoolArray, BoolArray]
@@ -222,7 +227,8 @@ class Merged(Rule):
             renewal = Renewal(world, world.motion)
             sets = renewal.sets(table)
             value = renewal.value(sets)
-            values.append(value)
+            # Behind the cells stand those in which the safe action has missed, if it does.
+            values.append(value[: self.cells])
             after = renewal.problem(value).after([on[:, None] for on in sets])
             for step, worth, (codes, found) in zip(renewal.steps, after, worths, strict=False):
                 located, state = step.rows + kind * self.cells, step.states + kind * self.cells
@@ -309,16 +315,17 @@ def followed(
         report: which targets are in the grid, and which were located.
     """
     task, (present, seen) = group.task, report
-    cell = moved.state % task.num_cells
-    sees = switched_on(on, moved.row // present.shape[1] * task.num_cells + cell)
-    missed = (present & ~seen).ravel()
-    left = moved.given(missed, np.asarray(sees * task.detects(cell), dtype=np.float64), missed.size)
+    cell, episode = moved.state % task.num_cells, moved.row // present.shape[1]
+    late, missed = clocks.late(task.t_max), (present & ~seen).ravel()
+    chance = switched_on(on, episode * task.num_cells + cell) * task.detects(cell)
+    chance = np.where(late[episode], task.safe_detection[cell], chance)
+    left = moved.given(missed, np.asarray(chance, dtype=np.float64), missed.size)
     again = np.flatnonzero(seen.ravel())
     found = left.joined(Beliefs.at(again, place.ravel()[again]), group.kernel.shape[0])
-    # A target that has left keeps no clock.
-    misses = np.where(present & ~seen, clocks.misses + 1, 0)
+    # A target that has left keeps no clock; one that the safe action missed is due for the next one.
+    misses = np.where(present & ~seen, np.minimum(clocks.misses + 1, task.t_max + 1), 0)
     located = np.where(seen, place, clocks.located)
-    return Clocks(located, misses, present, clocks.remembered(on)), found
+    return Clocks(located, misses, present, clocks.remembered(on, late)), found
 
 
 def switched_on(sets: IndexArray, codes: IndexArray) -> BoolArray:

@@ -23,8 +23,9 @@ class Group(Carded):
     """K independent, labelled targets: a reward for each detection, and sensors that are paid once.
 
     The sensors that are on are paid once in a step while any target is in the grid. When any clock runs out, the safe
-    action takes their place: it locates all targets, and D is paid once. The tracker is shown which target a report is
-    of, and when one leaves the grid; the episode ends with the last one.
+    action takes their place: it locates all targets, or misses each with probability 1 - p_s, and D is paid once; it is
+    repeated while a clock stands at t_max + 1. The tracker is shown which target a report is of, and when one leaves
+    the grid; the episode ends with the last one.
 
     Args:
         worlds: one for each target, alike but for the motion; the same object where targets move alike.
@@ -32,8 +33,7 @@ class Group(Carded):
             alone; see `of_tracks`.
 
     Raises:
-        UserError: they differ in more than the motion, or have modes, footprints, a window, a memory or a safe action
-            that misses.
+        UserError: they differ in more than the motion, or have modes, footprints, a window or a memory.
     """
 
     worlds: Sequence[World]
@@ -208,13 +208,13 @@ def _of_one_target(world: World) -> str | None:
         "footprints": world.coverage is not None,
         f"grid.window={world.window}": world.window is not None,
         f"task.memory={world.memory}": world.memory != "cell",
-        "a safe action that misses": not world.safe,
     }
     return next((name for name, there in parts.items() if there), None)
 
 
 def _alike(one: World, other: World) -> bool:
     """Whether two worlds are the same task."""
-    names = ("size", "cost", "t_max", "safe_cost", "reward", "detection", "budget", "max_steps")
+    prices, limits = ("cost", "safe_cost", "reward"), ("size", "t_max", "budget", "max_steps")
+    names = (*prices, *limits, "detection", "safe_detection")
     pairs = [(getattr(one, name), getattr(other, name)) for name in names]
     return all(np.array_equal(a, b, equal_nan=isinstance(a, np.ndarray)) for a, b in pairs)

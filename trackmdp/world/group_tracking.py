@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,12 +33,14 @@ class GroupTracking(TargetBatch):
         self._paths = group_paths(group, device)
         self._targets = group_members(self._paths, count)
         self._cells, self._max_steps = task.num_cells, task.max_steps
-        self._reports = UniformDraws(device, None if task.perfect else "report")
+        self._reports = UniformDraws(device, None if task.perfect and task.safe else "report")
         self._every = torch.ones(count * self.targets, dtype=torch.bool, device=device)
         self._costs, self._t_max = Costs(task, device), task.t_max
         self._reward, self._safe = task.reward, task.safe_cost
         self._history = (count, task.num_choices, task.total_sensors)
-        self._detection = torch.as_tensor(task.detection, device=device)
+        # Of the sensors, and of the safe action.
+        chances = np.stack([task.detection, task.safe_detection])
+        self._detection = torch.as_tensor(chances, device=device)
         self._available = torch.as_tensor(task.available, device=device)
         self.masked = not task.available.all()
         self.state = {}
@@ -80,21 +83,21 @@ class GroupTracking(TargetBatch):
         # A target that enters is located, and counts from the next step on, as the start of an episode is no step.
         present, n = inside & state["present"], state["steps_since_detection"]
         forced = (n > self._t_max).any(-1, keepdim=True)
-        report = action.gather(1, cell)
+        report = action.gather(1, cell) | forced
         if uniform is not None:
-            report = report & (uniform.view(shape) < self._detection[cell])
-        seen, any_left = (report | forced) & present, present.any(-1, keepdim=True)
+            report = report & (uniform.view(shape) < self._detection[forced.long(), cell])
+        seen, any_left = report & present, present.any(-1, keepdim=True)
         spent = self._costs.price_of(action & self._available).unsqueeze(-1)
         spent = torch.where(forced, self._safe, spent) * any_left
         reward = self._reward * seen.sum(-1, keepdim=True) - spent
-        # The last action comes first; after the safe action, which locates all targets, nothing is remembered.
+        # The last action comes first; after the safe action nothing is remembered.
         history = torch.cat([action.unsqueeze(1), state["action_history"][:, :-1]], 1)
-        seen = seen | (inside ^ present)
+        seen, more = seen | (inside ^ present), (n + 1).clamp_max(self._t_max + 1)
         following = {
             "place": place,
             "last_cell": torch.where(seen, cell, state["last_cell"]),
-            # A target that has left keeps no clock, which would force the safe action.
-            "steps_since_detection": torch.where(inside & ~seen, n + 1, 0),
+            # A target that has left keeps no clock, which would force the safe action. If that misses, it is repeated.
+            "steps_since_detection": torch.where(inside & ~seen, more, 0),
             "present": inside,
             "action_history": history & ~forced.unsqueeze(-1),
             "reward": reward.float(),
@@ -107,11 +110,8 @@ class GroupTracking(TargetBatch):
             following["action_mask"] = state["action_mask"]
         self.state = {key: following[key] for key in state}
         # The exit of the last target counts, also on the last step allowed.
-        return following | {
-            "done": done,
-            "terminated": done & ~any_left,
-            "truncated": done & any_left,
-        }
+        flags = {"done": done, "terminated": done & ~any_left, "truncated": done & any_left}
+        return following | flags
 
     def target(self) -> Tensor:
         """`[B, K]` cells of the targets, M where they are not in the grid."""
