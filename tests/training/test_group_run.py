@@ -27,6 +27,7 @@ from trackmdp.solvers.group_value import evaluate_group
 from trackmdp.solvers.joint_rule import JointRule
 from trackmdp.solvers.merging import make_rule
 from trackmdp.solvers.solve import solve
+from trackmdp.training.group_run import joint_policy
 from trackmdp.training.inputs import problem_of
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.group import Group
@@ -197,6 +198,12 @@ def test_episodes_are_logged_while_learning_and_verify_to_the_bit(
         assert isinstance(last, JointRule)
         for name, part in last.packed()[0].items():
             np.testing.assert_array_equal(part, run.policy.packed()[0][name])
+        arrays = last.packed()[0]
+        forged = {
+            name: part * 1j if part.dtype.kind == "f" else part for name, part in arrays.items()
+        }
+        with pytest.raises(TypeError, match="complex"):
+            joint_policy(load_run_config(tmp_path), mixed, forged)
         # One at a time, as a batch of another size rounds otherwise.
         assert verify(reader, numbers=[13]).difference is None
 

@@ -79,12 +79,17 @@ def joint_policy(
     """The policy of a run with these options and weights (`JointRule.packed`).
 
     Raises:
-        RuntimeError: the weights are of other networks.
+        RuntimeError, TypeError: the weights are of other networks, or no real numbers.
     """
     device = torch.device("cpu")
     with preserved_global_rng():
         algorithm = make_algorithm(cfg, group.task, device, targets=group.targets)
-    weights = {name: torch.from_numpy(part) for name, part in arrays.items() if name != "targets"}
+    # torch would take the real parts of complex weights, and warn.
+    weights = {
+        name: torch.from_numpy(part.astype(np.float32, casting="same_kind"))
+        for name, part in arrays.items()
+        if name != "targets"
+    }
     actor: Any = algorithm.actor
     actor.load_state_dict(weights)
     return JointRule(group, actor, device)
