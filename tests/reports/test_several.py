@@ -5,13 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import trackmdp as tm
+from tests.tracks import by_hand, recorded
 from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.grouping import study
 from trackmdp.reports.page import Report, build
 from trackmdp.reports.results import load_results, save_results
+from trackmdp.world.group import Group
 
 FEW: dict[str, Any] = {"total_frames": 512, "frames_per_batch": 256, "envs": 32}
 
@@ -74,3 +77,15 @@ def test_single_targets_are_no_reference_and_give_no_curve(sweep: Path) -> None:
     assert {each.world for each in found.maps} == {
         world for world in study(found.runs).worlds if "K=1" in world
     }
+
+
+def test_on_recorded_tracks_figures_are_of_all_targets_and_have_no_bound(tmp_path: Path) -> None:
+    tracks = by_hand(*(np.random.default_rng(k).integers(9, size=6).tolist() for k in range(12)))
+    targets = Group.of_tracks(recorded(tracks), 2)
+    run = tm.train(targets, "model_based", folder=tmp_path / "a", **FEW)
+    (found,) = gather_runs(tmp_path).runs
+    assert not found.references  # those of one track alone are no match
+    row = rows(build(gather_runs(tmp_path)), "runs")["a"]
+    assert run.several is not None
+    assert row["AIHTR"] == run.several.figures.aihtr.mean == tm.evaluate(targets, run).aihtr.mean
+    assert row["upper bound"] is None

@@ -68,18 +68,18 @@ def _figures(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 def _references(summary: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Figures of other policies and bounds in the same world; on recordings those on the held-out tracks."""
+    if several := summary.get("several"):
+        # Q_MDP and fixed sets are of a single target.
+        merged, known = several["merged_optimum"], dict[str, dict[str, Any]]()
+        known |= {"best known": _together(merged)} if merged else {}
+        alone = {"separate trackers": several["apart"], "clocked bound": several["upper"]}
+        return known | {name: {"aihtr": end} for name, end in alone.items() if end is not None}
     if held_out := summary.get("held_out"):
         return {
             name: {key: figures[own]["mean"] for key, own in _TRACKED.items()}
             for name, figures in held_out["figures"].items()
             if name != "policy"
         }
-    if several := summary.get("several"):
-        # Q_MDP and fixed sets are of a single target.
-        merged, apart = several["merged_optimum"], several["apart"]
-        known = {"best known": _together(merged)} if merged else {}
-        known |= {} if apart is None else {"separate trackers": {"aihtr": apart}}
-        return {**known, "clocked bound": {"aihtr": several["upper"]}}
     policies = {"Q_MDP": summary["qmdp"], **summary.get("references", {})}
     found = {
         name: {key: each.get(key) for key in _TRACKED.values()}
