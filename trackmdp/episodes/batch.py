@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ import torch
 
 from trackmdp.episodes.belief_filter import beliefs
 from trackmdp.episodes.episode import Episode, Floats, Integers, last_cells
+from trackmdp.episodes.episode_draws import Columns
 from trackmdp.episodes.grids import check_layers
 from trackmdp.episodes.showing import Showing
 from trackmdp.notebook.card import Card, decimal, grid_words, percent
@@ -24,9 +25,6 @@ from trackmdp.world.model import Array, BoolArray
 from trackmdp.world.tracks import Problem
 
 _BELIEF = 25_600  # cells, or hidden states, of the beliefs updated together: memory stays bounded on large grids
-
-
-Columns: TypeAlias = dict[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,18 @@
-"""Random numbers of simulated episodes, each episode's from generators of its own."""
+"""Draws of simulated episodes, each episode's from generators of its own, and their steps put in order."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from trackmdp.seeding import derive
+
+Columns: TypeAlias = dict[str, npt.NDArray[Any]]
 
 _BLOCK = 256  # draws taken from an episode's generator at a time; part of the meaning of a seed, so never to be changed
 
@@ -45,3 +50,25 @@ class Draws:
             else:
                 self._block = drawn
         return self._block[row, place]
+
+
+def uniform(
+    seeds: Sequence[int], name: str, *shape: int, dtype: torch.dtype = torch.float64
+) -> Draws:
+    """`[R, *shape]` uniform in [0, 1)."""
+    return Draws(
+        seeds, lambda count, rng: torch.rand(count, *shape, dtype=dtype, generator=rng), name
+    )
+
+
+def joined(taken: Sequence[Columns]) -> tuple[Columns, npt.NDArray[np.int64]]:
+    """Columns of steps, taken together by the running episodes `row`, as one episode after another's; their lengths.
+
+    Steps were taken in order of time; a stable sort by episode leaves them so within each. Example: the rows 0 1 2,
+    then 0 2, then 2 (episode 1 ended first): the order is 0 3 1 2 4 5, the sorted rows are 0 0 1 2 2 2, the lengths 2 1
+    3.
+    """
+    columns = {name: np.concatenate([step[name] for step in taken]) for name in taken[0]}
+    row = columns.pop("row")
+    order = np.argsort(row, kind="stable")
+    return {name: column[order] for name, column in columns.items()}, np.bincount(row)

@@ -10,7 +10,7 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
-from trackmdp.episodes.episode_draws import Draws
+from trackmdp.episodes.episode_draws import Columns, Draws, joined, uniform
 from trackmdp.episodes.group_episode import GroupEpisode
 from trackmdp.solvers.linear import IndexArray
 from trackmdp.solvers.merging import Beliefs, Clocks, Rule, followed
@@ -52,13 +52,8 @@ class _Batch:
         # As with one target, moves and reports apart, so that two policies with one seed meet the same targets.
         self._moves, self._seen = Draws(seeds, self._move_draws), None
         if not (rule.task.perfect and rule.task.safe):
-            double = torch.float64
-            self._seen = Draws(
-                seeds,
-                lambda count, rng: torch.rand(count, targets, dtype=double, generator=rng),
-                "report",
-            )
-        self._taken: list[dict[str, Any]] = []
+            self._seen = uniform(seeds, "report", targets)
+        self._taken: list[Columns] = []
         self._kept: list[Beliefs] | None = [] if beliefs else None
 
     def _move_draws(self, count: int, rng: torch.Generator) -> Tensor:
@@ -75,13 +70,9 @@ class _Batch:
         while step != most and len(row := np.flatnonzero(clocks.present.any(axis=1))):
             place, clocks, beliefs = self._step(row, step, place, clocks, beliefs)
             step += 1
-        row = np.concatenate([step.pop("row") for step in self._taken])
-        # In order of time; a stable sort by episode leaves them so within each.
-        order, ends = np.argsort(row, kind="stable"), np.cumsum(np.bincount(row))[:-1]
-        columns = {
-            name: np.split(np.concatenate([step[name] for step in self._taken])[order], ends)
-            for name in self._taken[0]
-        }
+        steps, lengths = joined(self._taken)
+        ends = np.cumsum(lengths)[:-1]
+        columns = {name: np.split(column, ends) for name, column in steps.items()}
         return [
             self._episode(number, start, {name: column[number] for name, column in columns.items()})
             for number, start in enumerate(starts)

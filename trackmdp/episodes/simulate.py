@@ -15,7 +15,7 @@ from torch import Tensor
 
 from trackmdp.episodes.actors import Actor, States, actor_of
 from trackmdp.episodes.batch import Episodes
-from trackmdp.episodes.episode_draws import Draws
+from trackmdp.episodes.episode_draws import Columns, Draws, joined, uniform
 from trackmdp.episodes.group_episodes import GroupEpisodes
 from trackmdp.errors import UserError
 from trackmdp.machine import check_free
@@ -155,17 +155,12 @@ class _Batch:
         # Moves, choices and reports apart, so that two policies with one seed meet the same target.
         self._moves, self._choices, self._seen = Draws(seeds, sampler.draw), None, None
         if size := actor.num_draws:
-            self._choices = Draws(
-                seeds, lambda count, rng: torch.rand(count, size, generator=rng), "policy"
-            )
+            self._choices = uniform(seeds, "policy", size, dtype=torch.float32)
         if not outcomes.certain:
-            double = torch.float64
-            self._seen = Draws(
-                seeds, lambda count, rng: torch.rand(count, dtype=double, generator=rng), "report"
-            )
-        self._taken: list[dict[str, npt.NDArray[Any]]] = []
+            self._seen = uniform(seeds, "report")
+        self._taken: list[Columns] = []
 
-    def run(self) -> dict[str, npt.NDArray[Any]]:
+    def run(self) -> Columns:
         """Step until the last episode has ended; the columns of `Episodes`, those of one episode after another's."""
         # Before any move.
         starts = [
@@ -178,23 +173,10 @@ class _Batch:
         at = States(torch.arange(len(start)), place, start, key, torch.zeros_like(start), step=0)
         while len(at.row):
             at = self._step(at)
-        columns = {
-            name: np.concatenate([step[name] for step in self._taken]) for name in self._taken[0]
-        }
-        row = columns.pop("row")
-        # Steps were taken in order of time; a stable sort by episode leaves them so within each. Example: the rows 0 1
-        # 2, then 0 2, then 2 (episode 1 ended first): the order is 0 3 1 2 4 5, the sorted rows are 0 0 1 2 2 2,
-        # `length` is 2 1 3.
-        order = np.argsort(row, kind="stable")
-        begun = {
-            "start": start.numpy(),
-            "start_mode": (0 * start if mode is None else mode).numpy(),
-        }
-        return (
-            {name: column[order] for name, column in columns.items()}
-            | begun
-            | {"length": np.bincount(row)}
-        )
+        columns, length = joined(self._taken)
+        start_mode = 0 * start if mode is None else mode
+        begun = {"start": start.numpy(), "start_mode": start_mode.numpy()}
+        return columns | begun | {"length": length}
 
     def _step(self, at: States) -> States:
         """One step of `TrackEnv`, of the episodes still running; the same order of events, the same arithmetic."""

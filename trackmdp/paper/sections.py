@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple, replace
 from typing import Any
 
@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike
 from trackmdp.paper import calibration
 from trackmdp.paper.calibration import DRAWS, Candidate, Openings, Setting, Spread, chosen
 from trackmdp.paper.check import Check
-from trackmdp.paper.worlds import COSTS, PRINTED_QMDP, PRINTED_TMDP, SUPPORTS, pairs
+from trackmdp.paper.worlds import COSTS, PRINTED_QMDP, PRINTED_TMDP, SUPPORTS, Pairs, pairs
 from trackmdp.reports.grouping import Study
 from trackmdp.reports.page import Part, Section
 from trackmdp.reports.style import INK, LOOKS, Axes, Canvas, Figure, draw_figure, legend, tidy
-from trackmdp.reports.tables import Cell, Column, Table, paragraphs
+from trackmdp.reports.tables import Cell, Column, Rows, Table, paragraphs
 from trackmdp.world.model import Array
 
 # One colour per Z through all figures of this part; they are those of methods, which do not occur here.
@@ -87,7 +87,7 @@ def fit_table(settings: Sequence[Setting]) -> Table:
             setting.deviation
         )
     ordered = sorted(fits.items(), key=lambda item: max(item[1].values()))
-    rows: list[list[Cell]] = [
+    rows: Rows = [
         [*setting, *(fit[z] for z in SUPPORTS), max(fit.values())] for setting, fit in ordered
     ]
     columns = [
@@ -165,9 +165,7 @@ def _ranges(
     title = f"{label} {under}: median and range, n = {len(DRAWS)} draws{dotted}"
     columns = [Column(each) for each in ("border", "T_max", "Z")]
     columns += [Column(each, 2) for each in ("median", "low", "high")]
-    numbers: list[list[Cell]] = [
-        [s.border, s.t_max, s.support_size, *astuple(of(s))] for s in settings
-    ]
+    numbers: Rows = [[s.border, s.t_max, s.support_size, *astuple(of(s))] for s in settings]
     table = Table(f"sensitivity-{name}", title, columns, numbers)
     return draw_figure(table, 4.2, paint)
 
@@ -190,9 +188,9 @@ def sections(study: Study, openings: Openings) -> list[Section]:
     return [*([accuracy] if chosen else []), _worlds(openings), _critique(study, chosen, openings)]
 
 
-def accuracy_table(study: Study, chosen: Mapping[tuple[int, float], str]) -> Table:
+def accuracy_table(study: Study, chosen: Pairs) -> Table:
     """Table II of the paper beside exact accuracies: of Q_MDP, and of each method the mean over seeds."""
-    rows: list[list[Cell]] = []
+    rows: Rows = []
     # The order of Table II: by price, and Z = 5, 4, 3 within one.
     for (support_size, cost), world in sorted(
         chosen.items(), key=lambda item: (item[0][1], -item[0][0])
@@ -222,7 +220,7 @@ def accuracy_table(study: Study, chosen: Mapping[tuple[int, float], str]) -> Tab
     )
 
 
-def _about_accuracy(study: Study, chosen: Mapping[tuple[int, float], str]) -> str:
+def _about_accuracy(study: Study, chosen: Pairs) -> str:
     """The reference of the printed accuracies, and the learned accuracies that differ from them."""
     words, printed = paragraphs("trackmdp.paper"), PRINTED_TMDP.values()
     a2c = [
@@ -252,7 +250,7 @@ def _worlds(openings: Openings) -> Section:
     return Section("worlds", "The paper's worlds, calibrated", parts, tables)
 
 
-def _critique(study: Study, chosen: Mapping[tuple[int, float], str], openings: Openings) -> Section:
+def _critique(study: Study, chosen: Pairs, openings: Openings) -> Section:
     bounds = bounds_table(study, chosen)
     text = _points(study, bounds, chosen, openings.checks)
     return Section(
@@ -264,7 +262,7 @@ def _critique(study: Study, chosen: Mapping[tuple[int, float], str], openings: O
 
 def checks_table(found: Iterable[Check]) -> Table:
     """Every statement checked, with its largest deviation; -inf where there was no case to check."""
-    rows: list[list[Cell]] = [
+    rows: Rows = [
         [
             c.name,
             c.statement,
@@ -285,9 +283,9 @@ def checks_table(found: Iterable[Check]) -> Table:
     return Table("theorems", caption, columns, rows)
 
 
-def bounds_table(study: Study, pairs: Mapping[tuple[int, float], str]) -> Table:
+def bounds_table(study: Study, pairs: Pairs) -> Table:
     """The bounds of each pair beside the optimum: marked where the printed one is below a policy's value."""
-    rows: list[list[Cell]] = []
+    rows: Rows = []
     for (support_size, cost), world in pairs.items():
         # Bounds are the world's, so that any run has them; the bracket of the optimum is the best that some run found.
         best, upper = study.lower(world), study.upper(world)
@@ -319,9 +317,7 @@ def bounds_table(study: Study, pairs: Mapping[tuple[int, float], str]) -> Table:
     )
 
 
-def _points(
-    study: Study, table: Table, pairs: Mapping[tuple[int, float], str], found: Sequence[Check]
-) -> str:
+def _points(study: Study, table: Table, pairs: Pairs, found: Sequence[Check]) -> str:
     """The headings and paragraphs of `critique.txt`, in the order of the paper, with the figures of this sweep."""
     forms = ("as printed", "exact form")
     printed, exact = (
@@ -347,7 +343,7 @@ def _exit_price(table: Table, found: Sequence[Check]) -> dict[str, Any]:
     return {"exceeded": len(exceeded), "pairs": len(table.rows), "where": where, "remark": remark}
 
 
-def _hardest(study: Study, pairs: Mapping[tuple[int, float], str]) -> dict[str, Any]:
+def _hardest(study: Study, pairs: Pairs) -> dict[str, Any]:
     """How tight the clocked bound is, and where it is not attained."""
     short = {}
     for (support_size, cost), world in pairs.items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import chain, product
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -64,7 +64,11 @@ def paper_world(kernel: Array, cost: float, t_max: int) -> World:
     )
 
 
-def pairs(study: Study) -> dict[tuple[int, float], str]:
+Pairs: TypeAlias = Mapping[tuple[int, float], str]
+"""(Z, c) -> label of a world."""
+
+
+def pairs(study: Study) -> Pairs:
     """The paper's (Z, c) -> the label of the world that stands for it, in the order of the figures.
 
     Where several do (other T_max, border or kernel), it is the one with most runs.

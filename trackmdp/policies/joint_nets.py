@@ -6,7 +6,7 @@ over targets as well (theory.md#several-targets), so that a logit that is a sum 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -39,6 +39,11 @@ class OverTargets(nn.Module):
             total = summed if total is None else total + summed
         assert total is not None
         return total
+
+
+def of_kinds(make: Callable[[], nn.Module], targets: Sequence[int]) -> nn.Module:
+    """A part for a single target; of several, of the kinds `targets`, one for each kind, added up."""
+    return OverTargets((make() for _ in set(targets)), targets) if targets else make()
 
 
 def _since(history: Tensor, n: Tensor) -> Tensor:

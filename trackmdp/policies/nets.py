@@ -9,6 +9,7 @@ may be run on all of its rows at once.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -21,7 +22,7 @@ from torchrl.modules import ProbabilisticActor, ValueOperator
 
 from trackmdp.policies.few_sensors import FewSensors, greedy
 from trackmdp.policies.forms import state_keys
-from trackmdp.policies.joint_nets import OverTargets, last_clock
+from trackmdp.policies.joint_nets import last_clock, of_kinds
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
@@ -87,25 +88,12 @@ class StateNetwork(nn.Module):
         self, task: Task, hidden: int, head: nn.Linear, targets: Sequence[int] = ()
     ) -> None:
         super().__init__()
-        self.encoder, self.head = _encoder(task, hidden, targets), head
+        self.encoder = of_kinds(partial(StateEncoder, task, hidden), targets)
+        self.head = head
 
     def forward(self, *state: Tensor) -> Tensor:
         """`[..., head.out_features]` of a batch of states of shape `[...]`, the arguments those of the encoder."""
         return self.head(self.encoder(*state))
-
-
-def _encoder(task: Task, hidden: int, targets: Sequence[int], **scales: float) -> nn.Module:
-    """A `StateEncoder`, of several targets one for each kind, added up."""
-    if not targets:
-        return StateEncoder(task, hidden, **scales)
-    return OverTargets((StateEncoder(task, hidden, **scales) for _ in set(targets)), targets)
-
-
-def _shared(task: Task, targets: Sequence[int]) -> nn.Module:
-    """A `RelativeBias`, of several targets as `_encoder`."""
-    if not targets:
-        return RelativeBias(task)
-    return OverTargets((RelativeBias(task) for _ in set(targets)), targets)
 
 
 class RelativeBias(nn.Module):
@@ -210,7 +198,8 @@ def make_actor(
     nn.init.orthogonal_(head.weight, gain=0.01)
     nn.init.constant_(head.bias, initial_logit)
     window = None if task.numbered is None else Window.of(task)
-    network = _Logits(StateNetwork(task, hidden, head, targets), _shared(task, targets), window)
+    shared = of_kinds(partial(RelativeBias, task), targets)
+    network = _Logits(StateNetwork(task, hidden, head, targets), shared, window)
     few = task.budget is not None and task.budget < task.num_sensors
     return ProbabilisticActor(
         TensorDictModule(network, in_keys=state_keys(task, targets), out_keys=["logits"]),
@@ -264,9 +253,10 @@ class AdditiveQ(nn.Module):
     def __init__(self, task: Task, hidden: int, scale: float, targets: Sequence[int] = ()) -> None:
         super().__init__()
         self.t_max, self.targets = task.t_max, targets
-        self.encoder = _encoder(task, hidden, targets, scale=1.0, history_scale=0.03)
+        encoder = partial(StateEncoder, task, hidden, scale=1.0, history_scale=0.03)
+        self.encoder = of_kinds(encoder, targets)
         self.base, self.sensor = nn.Linear(hidden, 1), nn.Linear(hidden, task.num_sensors)
-        self.shared = _shared(task, targets)
+        self.shared = of_kinds(partial(RelativeBias, task), targets)
         for head, start in ((self.base, 0.0), (self.sensor, _ALL_ON)):
             nn.init.orthogonal_(head.weight, gain=0.01)
             nn.init.constant_(head.bias, start)

@@ -89,8 +89,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
         if task.keyed:
             self.in_keys = ["last_cell", "key", "steps_since_detection"]
         self.generator: torch.Generator | None = None
-        self._lookup: DenseTable | SparseTable | None = None
-        self._local: DenseTable | SparseTable | None = None  # of the window's sensors alone
+        self._lookups: dict[tuple[torch.device, bool], DenseTable | SparseTable] = {}
 
     def __repr__(self) -> str:
         # The card, not the list of parts that torch shows of a module.
@@ -231,11 +230,12 @@ class Policy(TensorDictModuleBase, PolicyTable):
         """`[*B]`, the row of `sets` for a state; where the safe action is forced, the row of the last free choice."""
         return key * self.task.num_choices + steps_since_detection.clamp_max(self.task.t_max)
 
-    def lookup(self, device: torch.device) -> DenseTable | SparseTable:
-        """The rows of `sets` on a device."""
-        if self._lookup is None or self._lookup.device != device:
-            self._lookup = looked_up(self.sets, device)
-        return self._lookup
+    def lookup(self, device: torch.device, *, local: bool = False) -> DenseTable | SparseTable:
+        """The rows of `sets` on a device, of all sensors or of those of the window alone."""
+        if (device, local) not in self._lookups:
+            table = in_window(self.task, self.sets) if local else self.sets
+            self._lookups[device, local] = looked_up(table, device)
+        return self._lookups[device, local]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` `[*B, K]`: over all cells, or in the local numbers of the window around `last_cell`.
@@ -266,9 +266,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
         if self.sets is None:
             shape = (*key.shape, self.task.num_sensors)
             return torch.zeros(shape, dtype=torch.bool, device=key.device)
-        if self._local is None or self._local.device != key.device:
-            self._local = looked_up(in_window(self.task, self.sets), key.device)
-        return self._local(self.row(key, steps_since_detection))
+        return self.lookup(key.device, local=True)(self.row(key, steps_since_detection))
 
     def tracker(
         self,

@@ -22,7 +22,7 @@ from trackmdp.reports.style import (
     looks_of,
     tidy,
 )
-from trackmdp.reports.tables import Cell, Column, Table, interval_columns
+from trackmdp.reports.tables import Column, Rows, Table, interval_columns
 from trackmdp.reports.ticks import label_values
 from trackmdp.statistics import MeanInterval, mean_over_groups, share
 from trackmdp.world.model import Array
@@ -93,7 +93,7 @@ def _line_figure(
         legend(figure, axes)
 
     columns = [Column("line"), *heads, *interval_columns(heads[1].digits), Column("n")]
-    rows: list[list[Cell]] = [
+    rows: Rows = [
         [line.name, float(x), each.mean, each.low, each.high, each.n or None]
         for line in lines
         for x, each in [*zip(line.x, line.row, strict=True)][::thin]

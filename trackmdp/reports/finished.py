@@ -16,7 +16,7 @@ from trackmdp.errors import UserError
 from trackmdp.policies.saved import load_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.reports.maps import MOST_MAP_CELLS
-from trackmdp.reports.results import FIGURES, HELD_OUT, FinishedRun, Mapped, checked_run
+from trackmdp.reports.results import FIGURES, HELD_OUT, FinishedRun, Mapped, checked
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.hidden import averaged
 from trackmdp.solvers.linear import DIRECT_CELLS, IndexArray, per_row
@@ -44,10 +44,9 @@ def read_run(place: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]]:
     config = parse_yaml(read_text(place / "config.yaml"), str(place / "config.yaml"))
     curve = read_curve(place, summary) if (place / METRICS).is_file() else []
     with decoded(str(place / SUMMARY), "the summary of a run"):
-        return (
-            checked_run(name, flatten(config), _figures(summary), _references(summary), curve),
-            summary,
-        )
+        settings, figures = flatten(config), _figures(summary)
+        run = FinishedRun(name, settings, figures, _references(summary), curve)
+        return checked(run), summary
 
 
 def _figures(summary: Mapping[str, Any]) -> dict[str, Any]:

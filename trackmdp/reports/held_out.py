@@ -12,7 +12,7 @@ import numpy as np
 
 from trackmdp.episodes.episode import Episode
 from trackmdp.reports.page import Report, Section
-from trackmdp.reports.tables import Cell, Column, Table, interval_columns, paragraphs
+from trackmdp.reports.tables import Cell, Column, Rows, Table, interval_columns, paragraphs
 from trackmdp.solvers.evaluation import ReplayedTracks
 from trackmdp.world.gridding import said
 from trackmdp.world.model import Array
@@ -100,7 +100,7 @@ def _table(names: Mapping[str, str], report: Mapping[str, Any]) -> Table:
     columns = [Column("policy")]
     for column in _FIGURES.values():
         columns += [column, *interval_columns(column.digits)]
-    rows: list[list[Cell]] = []
+    rows: Rows = []
     for name, figures in report["figures"].items():
         row: list[Cell] = [names[name]]
         for key, column in _FIGURES.items():

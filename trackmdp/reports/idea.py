@@ -8,8 +8,17 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.reports.results import Mapped
-from trackmdp.reports.style import BLUE, INK, LINE, VERMILION, Axes, Canvas, Figure, draw_figure
-from trackmdp.reports.tables import Cell, Column, Table
+from trackmdp.reports.style import (
+    BLUE,
+    INK,
+    VERMILION,
+    Axes,
+    Canvas,
+    Figure,
+    draw_figure,
+    grid_lines,
+)
+from trackmdp.reports.tables import Column, Rows, Table
 from trackmdp.world.model import Array, BoolArray
 
 _MARGIN = 1
@@ -86,7 +95,7 @@ def idea_figure(drawn: Mapped) -> Figure | None:
         for axes, scene in zip(figure.subplots(2, 2).ravel(), story, strict=True):
             _paint(axes, scene, columns, part)
 
-    rows: list[list[Cell]] = [
+    rows: Rows = [
         [
             scene.title,
             cell // columns + 1,
@@ -120,8 +129,7 @@ def _paint(axes: Axes, scene: Scene, columns: int, part: list[tuple[int, int]]) 
         if scene.on[cell]:
             corner = (column + 0.09, row + 0.09)
             axes.add_patch(Rectangle(corner, 0.82, 0.82, fill=False, edgecolor=INK, linewidth=1.6))
-    axes.vlines(np.arange(left, right + 1), top, bottom, colors=LINE, linewidths=0.5)
-    axes.hlines(np.arange(top, bottom + 1), left, right, colors=LINE, linewidths=0.5)
+    grid_lines(axes, np.arange(left, right + 1.0), np.arange(top, bottom + 1.0))
     if scene.target is not None:
         row, column = divmod(scene.target, columns)
         filled = VERMILION if scene.found else "none"

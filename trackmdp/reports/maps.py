@@ -14,15 +14,15 @@ from trackmdp.reports.results import Mapped
 from trackmdp.reports.style import (
     BLUE,
     INK,
-    LINE,
     PALE,
     VERMILION,
     Axes,
     Canvas,
     Figure,
     draw_figure,
+    grid_lines,
 )
-from trackmdp.reports.tables import Cell, Column, Table
+from trackmdp.reports.tables import Column, Rows, Table
 from trackmdp.world.model import Array, BoolArray
 
 # 20 x 20: with tiles of four to six cells each, more would not be seen on a page.
@@ -78,7 +78,7 @@ def _table_of_sets(
     name: str, title: str, drawn: Mapped, sets: Sequence[Array], possible: Sequence[BoolArray]
 ) -> Table:
     """A row for each located cell and number of misses that can happen."""
-    rows: list[list[Cell]] = [
+    rows: Rows = [
         [x, n, float(on[x].sum()), int(can[x].sum()), _cells_text(on[x], drawn.size)]
         for x in range(len(drawn.value))
         for n, (on, can) in enumerate(zip(sets, possible, strict=False))
@@ -177,7 +177,7 @@ def binned(values: Array, size: _Size) -> Array:
 
 def _tiles_table(name: str, title: str, tiles: Mapping[str, Array], side: int) -> Table:
     """A row for each tile, by the row and column of its first cell."""
-    rows: list[list[Cell]] = [
+    rows: Rows = [
         [side * i + 1, side * j + 1, *(float(values[i, j]) for values in tiles.values())]
         for i, j in np.ndindex(*next(iter(tiles.values())).shape)
     ]
@@ -224,9 +224,7 @@ def _draw_tiles(axes: Axes, on: Array, possible: BoolArray, size: _Size, reach: 
     centre = reach + 0.5
     axes.plot(column * side + centre, row * side + centre, ".", color=INK, markersize=12 / side)
     # A frame around each tile: with reach 1 tiles are 4 apart and their cells begin at 0, 4, ..., frames at -0.5, 3.5.
-    right, below = columns * side - 0.5, rows * side - 0.5
-    axes.vlines(np.arange(columns + 1) * side - 0.5, -0.5, below, colors=LINE, linewidths=0.5)
-    axes.hlines(np.arange(rows + 1) * side - 0.5, -0.5, right, colors=LINE, linewidths=0.5)
+    grid_lines(axes, *(np.arange(count + 1) * side - 0.5 for count in (columns, rows)))
     axes.set(xlim=(-1, columns * side), ylim=(rows * side, -1), aspect="equal")
     axes.set_axis_off()
 

@@ -69,27 +69,22 @@ class FinishedRun:
         return math.nan if value is None else value
 
 
-def checked_run(
-    name: str,
-    settings: Mapping[str, Any],
-    figures: Mapping[str, Any],
-    references: Mapping[str, Mapping[str, Any]],
-    curve: Sequence[Sequence[Any]],
-) -> FinishedRun:
-    """A run from plain values of a file; arguments as the attributes of `FinishedRun`.
+def checked(run: FinishedRun) -> FinishedRun:
+    """A run of plain values of a file.
 
     Raises:
         Exception: of any kind, for values of another kind; call it inside `untrusted.decoded`.
     """
-    plain = {printable(key): _printable(value) for key, value in settings.items()}
+    plain = {printable(key): _printable(value) for key, value in run.settings.items()}
     names = {key: str(plain[key]) for key in ("algo.name", "kernel.name")}
-    numbers = _numbers(figures)
+    numbers = _numbers(run.figures)
     missing = [key for key in NEEDED if numbers[key] is None]
     if missing or not numbers["expected_length"]:  # regrets are per step
         raise ValueError(f"{missing or 'expected_length'}: expected a number above 0")
-    others = {str(key): _numbers(each) for key, each in references.items()}
-    points = [tuple(map(float, point)) for point in curve]
-    return FinishedRun(name, plain | names | {"seed": int(plain["seed"])}, numbers, others, points)
+    others = {str(key): _numbers(each) for key, each in run.references.items()}
+    points = [tuple(map(float, point)) for point in run.curve]
+    settings = plain | names | {"seed": int(plain["seed"])}
+    return FinishedRun(run.name, settings, numbers, others, points)
 
 
 def _printable(value: Any) -> Any:
@@ -201,7 +196,7 @@ def load_results(folder: Path) -> Results:
         if content["format"] != FORMAT:
             raise ValueError(f"format {content['format']!r}, expected {FORMAT!r}")
         given = from_arrays(arrays)
-        runs = [checked_run(**run) for run in content["runs"]]
+        runs = [checked(FinishedRun(**run)) for run in content["runs"]]
         maps = [_mapped(place, given) for place in range(content["maps"])]
         anomalies = [Anomaly(**each) for each in content["anomalies"]]
         return Results(runs, maps, anomalies, dict(content["manifest"]))

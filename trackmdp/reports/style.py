@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 from itertools import chain, cycle
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import numpy.typing as npt
+
 from trackmdp.reports.tables import Table
 from trackmdp.reports.ticks import Axes as Axes
 from trackmdp.reports.ticks import label_ticks
@@ -136,6 +138,12 @@ def tidy(axes: Axes) -> None:
     axes.grid(True, color=LINE, linewidth=0.5)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def grid_lines(axes: Axes, x: npt.NDArray[Any], y: npt.NDArray[Any]) -> None:
+    """Lines between the cells of a grid, at the rising places `x` and `y`."""
+    axes.vlines(x, y[0], y[-1], colors=LINE, linewidths=0.5)
+    axes.hlines(y, x[0], x[-1], colors=LINE, linewidths=0.5)
 
 
 def legend(figure: Canvas, axes: Axes) -> None:

@@ -9,7 +9,7 @@ from trackmdp.config.compose import compose
 from trackmdp.errors import UserError
 from trackmdp.reports.grouping import OPEN, Study
 from trackmdp.reports.results import Anomaly
-from trackmdp.reports.tables import Cell, Column, Table, interval_columns
+from trackmdp.reports.tables import Cell, Column, Rows, Table, interval_columns
 from trackmdp.statistics import iqm, mean_over_groups
 
 FIGURES = {
@@ -43,7 +43,7 @@ def outcome_table(study: Study, threshold: float | None) -> Table:
     """
     spread = [*interval_columns(5), Column("interquartile mean", 5), Column("worst", 5)]
     spread += [*_within_column(threshold), Column("n")]
-    rows: list[list[Cell]] = []
+    rows: Rows = []
     for method in study.methods:
         groups = {key: [study.values(w, method, key) for w in study.worlds] for key in FIGURES}
         means = {key: mean_over_groups(each) for key, each in groups.items()}
@@ -91,7 +91,7 @@ def shortened(study: Study) -> list[str]:
 
 def groups_table(study: Study, threshold: float | None) -> Table:
     """Each method in each world, its seeds together."""
-    rows: list[list[Cell]] = []
+    rows: Rows = []
     for (world, method), runs in study.groups.items():
         known = {key: mean_over_groups([study.values(world, method, key)]) for key in FIGURES}
         cells = figure_cells({key: each.mean for key, each in known.items()})
@@ -108,7 +108,7 @@ def groups_table(study: Study, threshold: float | None) -> Table:
 
 def runs_table(study: Study) -> Table:
     """Every finished run."""
-    rows: list[list[Cell]] = []
+    rows: Rows = []
     for (world, method), runs in study.groups.items():
         for run in runs:
             cells = figure_cells({key: study.value(world, run, key) for key in FIGURES})

@@ -13,6 +13,7 @@ from trackmdp.durable import csv_text
 from trackmdp.untrusted import no_formula, printable
 
 Cell: TypeAlias = "float | int | str | bool | None"
+Rows: TypeAlias = list[list[Cell]]
 
 _LATEX = {letter: f"\\{letter}" for letter in "{}$&%#_"} | {
     "\\": r"\textbackslash{}",

@@ -23,7 +23,7 @@ from trackmdp.reports.style import (
     looks_of,
     tidy,
 )
-from trackmdp.reports.tables import Cell, Column, Table
+from trackmdp.reports.tables import Column, Rows, Table
 from trackmdp.solvers.tradeoff import Mixture, Tradeoff, upper_hull
 
 _SEEN = 0.005
@@ -109,7 +109,7 @@ def swept_figure(study: Study, panel: Panel) -> Figure | None:
         tidy(axes)
         legend(figure, axes)
 
-    rows: list[list[Cell]] = [[name, *each, each in hull, None] for each in best]
+    rows: Rows = [[name, *each, each in hull, None] for each in best]
     seeds = {
         (method, price): len(study.of(world, method))
         for price, world in zip(panel.costs, panel.worlds, strict=True)
