@@ -17,7 +17,7 @@ from trackmdp.world.model import Task
 from trackmdp.world.tracks import Problem, Recorded
 
 MOST_STEPS = 2000
-"""Steps on a page; a longer episode is cut there, with a note on the page."""
+"""Steps on a page, or frames of a video; a longer episode is cut there, with a note on the page."""
 
 PAGE_WIDE = 41
 """Rows and columns of a grid that are drawn at most: those around the target."""

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 
 from trackmdp.episodes.episode import Recording
+from trackmdp.episodes.episode_page import MOST_STEPS
 from trackmdp.episodes.sentences import sentence
 from trackmdp.episodes.target_colours import colour_of
 from trackmdp.errors import UserError, require
 from trackmdp.notebook.drawing import BLUE, INK, ORANGE
 from trackmdp.world.model import BoolArray, Task
 
-MOST_STEPS = 2000
-"""Frames of a video; a longer episode is cut there."""
 _DPI = 110
 
 

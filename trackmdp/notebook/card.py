@@ -93,9 +93,9 @@ def decimal(value: float | None, digits: int = 3) -> str:
     return f"{round(value, digits) + 0.0:,.{digits}f}"  # -0.0 + 0.0 is 0.0
 
 
-def percent(share: float | None, digits: int = 2) -> str:
+def percent(share: float | None) -> str:
     """A share as a percentage; a dash where there is none."""
-    return NONE if share is None or math.isnan(share) else f"{100 * share:.{digits}f} %"
+    return NONE if share is None or math.isnan(share) else f"{100 * share:.2f} %"
 
 
 def span(low: float, high: float) -> str:

@@ -105,17 +105,18 @@ def sensitivity_table(settings: Sequence[Setting]) -> Table:
     """Median and range over draws of three figures, for every setting and pair."""
     columns = [Column("border"), Column("T_max"), Column("Z"), Column("c", 2)]
     for label, digits in (("Q_MDP accuracy %", 2), ("Q_MDP AIHTR", 1), ("clocked bound AIHTR", 1)):
-        columns += [
-            Column(f"{label}, median", digits),
-            Column("low", digits),
-            Column("high", digits),
-        ]
+        columns += _spread_columns(f"{label}, median", digits)
     rows = [
         [*at, *accuracy, *simple, *clocked]
         for *at, accuracy, simple, clocked, _ in map(astuple, settings)
     ]
     caption = f"Median and range over {len(DRAWS)} draws of the kernel, by setting and pair"
     return Table("sensitivity", caption, columns, rows)
+
+
+def _spread_columns(head: str, digits: int) -> list[Column]:
+    """Columns of a `Spread`."""
+    return [Column(label, digits) for label in (head, "low", "high")]
 
 
 def sensitivity_figures(settings: Sequence[Setting]) -> list[Figure]:
@@ -163,8 +164,7 @@ def _ranges(
     under = f"under the paper's unstated settings, c = {settings[0].cost:g}"
     dotted = "; dotted: the printed values" if printed else ""
     title = f"{label} {under}: median and range, n = {len(DRAWS)} draws{dotted}"
-    columns = [Column(each) for each in ("border", "T_max", "Z")]
-    columns += [Column(each, 2) for each in ("median", "low", "high")]
+    columns = [*map(Column, ("border", "T_max", "Z")), *_spread_columns("median", 2)]
     numbers: Rows = [[s.border, s.t_max, s.support_size, *astuple(of(s))] for s in settings]
     table = Table(f"sensitivity-{name}", title, columns, numbers)
     return draw_figure(table, 4.2, paint)
@@ -272,13 +272,7 @@ def checks_table(found: Iterable[Check]) -> Table:
         ]
         for c in found
     ]
-    columns = [
-        Column("theorem"),
-        Column("statement"),
-        Column("largest deviation"),
-        Column("verdict"),
-        Column("note"),
-    ]
+    columns = [*map(Column, ("theorem", "statement", "largest deviation", "verdict", "note"))]
     caption = f"The paper's statements on the world with Z = {calibration.HARDEST}, c = {COSTS[0]}"
     return Table("theorems", caption, columns, rows)
 
