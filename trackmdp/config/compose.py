@@ -55,7 +55,7 @@ def compose(
             for parent in parents:
                 node = node[parent]
             node[last] = value
-    cfg = _checked(values, schema, folder or Path.cwd())
+    cfg = config_of(values, schema, folder or Path.cwd())
     refuse_ignored(cfg, typed)
     return cfg
 
@@ -97,7 +97,7 @@ def from_hydra(cfg: DictConfig, root: type[_C], folder: Path) -> _C:
     Raises:
         UserError: an unknown key (also one added with `+`), a missing value, a wrong type, or a broken rule.
     """
-    checked: _C = _checked(composed_values(cfg, root), root, folder)
+    checked: _C = config_of(composed_values(cfg, root), root, folder)
     return checked
 
 
@@ -130,7 +130,7 @@ def composed_values(cfg: DictConfig, schema: type[Any]) -> dict[str, Any]:
     return dict(values)
 
 
-def _checked(values: dict[str, Any], schema: type[Any], folder: Path) -> Any:
+def config_of(values: dict[str, Any] | DictConfig, schema: type[Any], folder: Path) -> Any:
     """The dataclasses of the values, resolved and checked."""
     cfg = build_config(resolved(values), schema)
     validate(cfg)

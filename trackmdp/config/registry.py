@@ -26,7 +26,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from omegaconf import AnyNode, OmegaConf
+from omegaconf import AnyNode, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException, UnsupportedValueType
 
 from trackmdp.config.options import GROUPS, ChoiceConfig, options
@@ -131,15 +131,21 @@ def choice_values(group: str, name: str) -> dict[str, Any]:
     return values
 
 
-def resolved(values: dict[str, Any]) -> dict[str, Any]:
-    """The values, nested by key, with every ``${...}`` replaced; ``???`` stays.
+def unresolved(values: dict[str, Any]) -> DictConfig:
+    """The values, nested by key, as a config of OmegaConf."""
+    return OmegaConf.create(_wrapped(values))
+
+
+def resolved(values: dict[str, Any] | DictConfig) -> dict[str, Any]:
+    """The values with every ``${...}`` replaced; ``???`` stays.
 
     Raises:
         UserError: an interpolation leads nowhere, or a value is of no kind that a file has.
     """
     register_resolvers()
     try:
-        plain: Any = OmegaConf.to_container(OmegaConf.create(_wrapped(values)), resolve=True)
+        config = values if isinstance(values, DictConfig) else unresolved(values)
+        plain: Any = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:
         # Its further lines (full_key, object_type) are about OmegaConf.
         where = f"{error.full_key}: " if isinstance(error, UnsupportedValueType) else ""
