@@ -27,6 +27,10 @@ def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def bad_values(item: Option) -> list[str]:
     """Values, as typed, of a wrong type or out of the range of an option."""
     bad = [] if item.nullable or item.kind is Any else ["null"]
+    if item.many:
+        bad += ["elsewhere", "[]", "[null]"] + (["[-1]"] if item.ge == 0 else [])
+        # A text of one's own may be a number.
+        return bad + (["[1.5]", "[elsewhere]"] if item.choices or item.kind is int else [])
     if item.kind is bool:
         bad += ["perhaps", "[true]", "3.5"]
     if item.kind in (int, float):
@@ -43,10 +47,6 @@ def bad_values(item: Option) -> list[str]:
         bad += ["1.5"]
     if item.kind is str and (item.choices or item.expects.startswith("cpu")):
         bad += ["elsewhere", "[cpu]"]
-    if item.kind in (list[int], list[str]):
-        bad += ["elsewhere", "[]", "[null]"] + (["[-1]"] if item.ge == 0 else [])
-        # A text of one's own may be a number.
-        bad += ["[1.5]", "[elsewhere]"] if item.choices or item.kind == list[int] else []
     if item.kind is Any:
         bad += ["-1", "words", "{a: 1}", "nan", "[1,2]"]
     return bad
@@ -57,7 +57,8 @@ def by_rules_of_its_own(item: Option) -> bool:
 
 
 KINDS = {
-    (item.kind, item.nullable, bool(item.choices)): index for index, (*_, item) in enumerate(CASES)
+    (item.kind, item.many, item.nullable, bool(item.choices)): index
+    for index, (*_, item) in enumerate(CASES)
 }
 TYPED = {
     *KINDS.values(),

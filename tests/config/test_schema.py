@@ -107,13 +107,22 @@ def every_option() -> list[tuple[str, Option]]:
 @pytest.mark.parametrize(("where", "item"), every_option())
 def test_every_option_says_what_it_is_and_what_it_may_be(where: str, item: Option) -> None:
     assert item.help, where
-    if item.kind in (int, float):
+    if item.kind in (int, float) and not item.many:
         assert item.ge is not None or item.gt is not None, where
         assert not item.allows(math.nan)
         assert not item.allows(math.inf)
         assert not item.allows(10**400)  # more digits than a float has
     if item.kind is str:
         assert item.choices or item.expects, where
+
+
+def test_a_mapping_is_a_value_of_the_options_that_are_one() -> None:
+    slurm = options(GROUPS["hydra/launcher"]["submitit_slurm"])
+    given = {"mail-type": "END"}
+    assert [slurm[name].allows(given) for name in ("additional_parameters", "partition")] == [
+        True,
+        False,
+    ]  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(("command", "choice"), COMBINATIONS)

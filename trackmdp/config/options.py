@@ -45,7 +45,8 @@ class Option:
         path: a text is a path, relative to the current folder of the command.
         words: texts of such an option that are no path.
         pair: a whole number, or a list of two; the field's type is ``Any``, as OmegaConf has no such union.
-        kind: type, and `nullable` whether null is allowed: `options` reads both off the annotation of the field.
+        kind: type, of a list that of its elements; `options` reads it off the annotation of the field, as it does
+            `many`, whether it is a list, and `nullable`, whether null is allowed.
     """
 
     help: str
@@ -61,6 +62,7 @@ class Option:
     words: tuple[str, ...] = ()
     pair: bool = False
     kind: Any = None
+    many: bool = False
     nullable: bool = False
 
     @property
@@ -69,7 +71,7 @@ class Option:
         words = self.expects
         if not words:
             words = f"one of {', '.join(self.choices)}" if self.choices else self._range()
-        words = f"a list, each {words}" if self._element else words
+        words = f"a list, each {words}" if self.many else words
         words += ", or a pair of them" if self.pair else ""
         words += " or null" if self.nullable else ""
         return words + (f" ({self.unit})" if self.unit else "")
@@ -78,13 +80,14 @@ class Option:
         """Whether `value` has the right type and lies in the range."""
         if value is None:
             return self.nullable
-        if isinstance(value, dict):  # a group, never an option
+        if isinstance(value, dict):
+            return typing.get_origin(self.kind) is dict
+        if isinstance(value, list) and (self.many or self.pair):
+            one = dataclasses.replace(self, many=False, pair=False, nullable=False)
+            right = len(value) == 2 if self.pair else bool(value)
+            return right and all(map(one.allows, value))
+        if self.many:
             return False
-        if self._element:
-            return isinstance(value, list) and bool(value) and all(map(self._element.allows, value))
-        if self.pair and isinstance(value, (list, tuple)):
-            one = dataclasses.replace(self, pair=False)
-            return len(value) == 2 and all(map(one.allows, value))
         # `cost.reward=10` is an integer to YAML.
         if self.kind is float and type(value) is int:
             value = as_float(value)
@@ -97,13 +100,6 @@ class Option:
             return re.fullmatch(self.pattern, value) is not None
         return not isinstance(value, (int, float)) or self._in_range(value)
 
-    @property
-    def _element(self) -> Option | None:
-        """The option of each element, if this is a list."""
-        if typing.get_origin(self.kind) is not list:
-            return None
-        return dataclasses.replace(self, kind=typing.get_args(self.kind)[0], nullable=False)
-
     def _in_range(self, value: float) -> bool:
         # YAML has words for infinite numbers and for nan. isfinite raises at integers of more digits than a float has.
         return abs(value) <= sys.float_info.max and (
@@ -114,8 +110,7 @@ class Option:
         )
 
     def _range(self) -> str:
-        kind = self._element.kind if self._element else self.kind
-        words = _KINDS.get(kind, str(kind))
+        words = _KINDS.get(self.kind, str(self.kind))
         if self.ge is not None and self.le is not None:
             return f"{words} from {_typed(self.ge)} to {_typed(self.le)}"
         signs = {">=": self.ge, ">": self.gt, "<=": self.le, "<": self.lt}
@@ -262,8 +257,11 @@ def _fields(schema: Any) -> dict[str, Option | Node]:
         if dataclasses.is_dataclass(several or kind):
             found[field.name] = Node(several or kind, nullable, bool(several))
         elif isinstance(described, Option):
-            kind = int if described.pair else kind
-            found[field.name] = dataclasses.replace(described, kind=kind, nullable=nullable)
+            many = typing.get_origin(kind) is list
+            kind = int if described.pair else typing.get_args(kind)[0] if many else kind
+            found[field.name] = dataclasses.replace(
+                described, kind=kind, many=many, nullable=nullable
+            )
         else:
             raise TypeError(
                 f"{schema.__name__}.{field.name} is neither option(...) nor a nested config"
