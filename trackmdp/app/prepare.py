@@ -26,8 +26,6 @@ from trackmdp.imports import importing
 if TYPE_CHECKING:
     from trackmdp.world.group import Subject
 
-WORLD_KEYS = ("grid", "kernel", "cost", "sensor")
-
 
 @dataclass(frozen=True)
 class Prepared:
@@ -177,13 +175,11 @@ def _check_files(cfg: CommandConfig, folder: Path, words: Sequence[str]) -> None
 
         cell_classes(classes, cfg.grid.sides)
     if runs := _runs(cfg):
+        # False alarms are for testing trained policies.
+        believed = isinstance(getattr(cfg, "sensor", None), config.FalseAlarmConfig)
+        own = {"grid", "kernel", "cost"} | ({"sensor"} if not believed else set())
         for word in words:
-            group = key_of(word).split(".")[0]
-            if group == "sensor" and isinstance(
-                getattr(cfg, "sensor", None), config.FalseAlarmConfig
-            ):
-                continue  # they are for testing trained policies
-            if group in WORLD_KEYS:
+            if key_of(word).split(".")[0] in own:
                 raise UserError(
                     f"{word}: not together with run={','.join(runs)}: its own world is used"
                 )

@@ -84,21 +84,12 @@ class RegimesConfig(HiddenKernelConfig):
             _regime(f"{key}.regimes[{place}]", entry, root)
             for place, entry in enumerate(self.regimes)
         ]
-        shares, probability = (
-            self.stay if isinstance(self.stay, list) else [self.stay],
-            Option("", ge=0, le=1),
-        )
-        if isinstance(self.stay, list) and len(shares) != len(self.regimes):
-            raise refuse(
-                f"{key}.stay", self.stay, f"one number, or {len(self.regimes)} (one per regime)"
-            )
-        for share in shares:
-            if (
-                isinstance(share, bool)
-                or not isinstance(share, (int, float))
-                or not probability.allows(share)
-            ):
-                raise refuse(f"{key}.stay", self.stay, "numbers from 0 to 1")
+        shares = self.stay if isinstance(self.stay, list) else [self.stay] * len(self.regimes)
+        if len(shares) != len(self.regimes):
+            expected = f"one number, or {len(self.regimes)} (one per regime)"
+            raise refuse(f"{key}.stay", self.stay, expected)
+        if not all(map(Option("", ge=0, le=1, kind=float).allows, shares)):
+            raise refuse(f"{key}.stay", self.stay, "numbers from 0 to 1")
 
 
 class VelocityConfig(HiddenKernelConfig):

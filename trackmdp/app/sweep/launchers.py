@@ -143,19 +143,10 @@ def run_on_slurm(cfg: sweeping.SubmititSlurmConfig, jobs: Sequence[Job]) -> None
     executor = submitit.AutoExecutor(
         folder, cluster="slurm", slurm_max_num_timeout=cfg.max_num_timeout
     )
-    asked = {
-        name: getattr(cfg, name)
-        for name in ("timeout_min", "cpus_per_task", "mem_gb", "gpus_per_node")
-    }
-    of_slurm = (
-        "array_parallelism",
-        "signal_delay_s",
-        "partition",
-        "account",
-        "setup",
-        "additional_parameters",
-    )
-    asked |= {f"slurm_{name}": getattr(cfg, name) for name in of_slurm}
+    # submitit has a word of its own for what every cluster has.
+    shared = ("timeout_min", "cpus_per_task", "mem_gb", "gpus_per_node")
+    asked = {name if name in shared else f"slurm_{name}": each for name, each in vars(cfg).items()}
+    del asked["slurm_max_num_timeout"]
     executor.update_parameters(name=f"trackmdp_{jobs[0].command}", **asked)
     # One array job, of which the scheduler runs `array_parallelism` at once; one job each would flood its queue.
     _wait(executor.map_array(Submission(), list(jobs)))

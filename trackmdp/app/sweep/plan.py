@@ -185,15 +185,10 @@ def sweep_name(command: str, words: Sequence[str], blocks: Sequence[str]) -> str
 
 
 def _varying(grid: Sequence[Sequence[str]]) -> set[str]:
-    """The options that differ between the runs of a grid."""
-    values: dict[str, set[str]] = {}
-    for word in (word for words in grid for word in words):
-        values.setdefault(key_of(word), set()).add(word)
-    # An option that is missing in some words varies too, though it has one value wherever it stands.
-    shared = {
-        key for key in values if all(any(key_of(word) == key for word in words) for words in grid)
-    }
-    return {key for key, found in values.items() if len(found) > 1 or key not in shared}
+    """The options that differ between the runs of a grid, or are missing in some."""
+    runs = [{key_of(word): word for word in words} for words in grid]
+    keys = {key for run in runs for key in run}
+    return {key for key in keys if len({run.get(key) for run in runs}) > 1}
 
 
 def _folders(sweep: Path) -> dict[str, str]:
