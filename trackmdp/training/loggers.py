@@ -268,9 +268,14 @@ class WandbLogger(_Tracker):
         own_folder(self._folder / "wandb")
         self._id = self._id or secrets.token_hex(4)
         # No console capture, machine statistics or code: only the run's figures are logged.
-        off = ("silent", "x_disable_stats", "disable_code", "disable_git")
-        quiet: dict[str, Any] = dict.fromkeys(off, True)
-        quiet |= {"console": "off", "x_save_requirements": False}
+        quiet = wandb.Settings(
+            silent=True,
+            console="off",
+            disable_code=True,
+            disable_git=True,
+            x_disable_stats=True,
+            x_save_requirements=False,
+        )
         with _answering("wandb"):
             self._run = wandb.init(
                 name=self._folder.resolve().name,
@@ -280,7 +285,7 @@ class WandbLogger(_Tracker):
                 project=self._cfg.project,
                 mode=cast(Any, self._cfg.mode),
                 config=to_dict(trainer.config),
-                settings=wandb.Settings(**quiet),
+                settings=quiet,
             )
 
     def write(self, row: Row) -> None:

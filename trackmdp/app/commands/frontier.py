@@ -35,8 +35,7 @@ def run(cfg: FrontierConfig, folder: Path, world: Problem) -> float:
         found = trace(world, cfg.solver, cfg.resolution, show)
     rows = [_row(number, corner, found) for number, corner in enumerate(found.corners)]
     write_corners(folder / "corners", found)
-    lines = (["" if each is None else each for each in row.values()] for row in rows)
-    write_text(folder / "frontier.csv", csv_text(rows[0], lines))
+    write_text(folder / "frontier.csv", csv_text(rows[0], (row.values() for row in rows)))
     write_json(folder / "frontier.json", _report(cfg, found, rows, {}))
     _show(console, found, folder)
     if found.interrupted:

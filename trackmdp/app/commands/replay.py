@@ -54,22 +54,21 @@ def _exports(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> bool
     """Write the page, the tables and the layout that are asked for; returns whether any was."""
     if not reader.rows and (cfg.html or cfg.csv):
         raise UserError(f"file={reader.file}: holds no episode")
-    writers: list[tuple[str, str | None, Callable[[Path], object]]] = [
-        ("html", cfg.html, lambda path: write_page(reader, path, cfg.episode)),
-        ("csv", cfg.csv, lambda path: write_tables(reader, path, cfg.episode)),
-        ("layout", cfg.layout, lambda path: write_layout(path, reader.run)),
-    ]
-    for key, path, write in writers:
-        if path is None:
-            continue
+    writers: dict[str, Callable[[Path], object]] = {
+        "html": lambda path: write_page(reader, path, cfg.episode),
+        "csv": lambda path: write_tables(reader, path, cfg.episode),
+        "layout": lambda path: write_layout(path, reader.run),
+    }
+    asked = {key: path for key in writers if (path := getattr(cfg, key)) is not None}
+    for key, path in asked.items():
         try:
-            write(Path(path))
+            writers[key](Path(path))
         except OSError as error:
             raise UserError(
                 f"{key}={path}: cannot be written ({(error.strerror or str(error)).lower()})"
             ) from error
         console.print(f"{key} -> {path}")
-    return any(path is not None for _, path, _ in writers)
+    return bool(asked)
 
 
 def _verify(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> None:
