@@ -41,8 +41,7 @@ class HiddenKernelConfig(KernelConfig):
 
     def check(self, key: str, root: Any) -> None:
         """Of the learners those with a memory take modes."""
-        known = f"with kernel={self.name}" + f" and {key}.reveals=true" * self.reveals
-        require_able(root, "told" if self.reveals else "remembers", known)
+        require_able(root, "remembers", f"with kernel={self.name}")
 
 
 @choice("kernel", "heading", makes="trackmdp.world.modes:heading_kernel")

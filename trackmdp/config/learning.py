@@ -66,9 +66,7 @@ class AlgoConfig(ChoiceConfig):
     """
 
     remembers: ClassVar[bool] = False
-    """Whether it learns policies that remember more than the cell (`task.memory`)."""
-    told: ClassVar[bool] = False
-    """Whether it learns where a detection reveals the mode of the target (`kernel.reveals`)."""
+    """Whether it learns policies that remember more than the cell: `task.memory`, modes, `kernel.reveals`."""
     knows_footprints: ClassVar[bool] = False
     """Whether sensors may cover several cells."""
     knows_budget: ClassVar[bool] = False
@@ -84,7 +82,6 @@ class EveryTaskConfig(AlgoConfig):
     """Base of the algorithms that learn with every memory, revealed mode and footprint."""
 
     remembers: ClassVar[bool] = True
-    told: ClassVar[bool] = True
     knows_footprints: ClassVar[bool] = True
 
 
