@@ -174,7 +174,9 @@ def test_one_target_whose_safe_action_misses_is_todays_world() -> None:
     world = tiny(2, t_max=1, safe_detection=np.array([0.5, 0.9, 0.7]), safe_cost=0.4)
     table = solve(world).table
     alone, group = evaluate(world, table), Group([world])
-    assert solve(group).lower is None
+    # Not even where D is that of all sensors, and none of them misses.
+    assert solve(Group([tiny(2)] * 2)).lower is not None
+    assert solve(Group([tiny(2, safe_detection=0.5)] * 2)).lower is None
     for merge in ("gains", "union"):
         found = evaluate_group(make_rule(group, [table], merge), episodes=20_000)
         assert found.aihtr.low is not None
