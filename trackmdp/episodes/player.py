@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
 import select
 import sys
 import termios
 import time
 import tty
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -95,23 +96,13 @@ def _cut(task: Task, parts: tuple[range, range]) -> list[str]:
 
 
 KEYS = "space pause   ← → step   + - speed   home end   q quit"
-_ESCAPES = {
-    "\x1b[C": "l",
-    "\x1b[D": "h",
-    "\x1b[H": "0",
-    "\x1b[F": "$",
-    "\x1b[1~": "0",
-    "\x1b[4~": "$",
+_MOVES = {
+    **dict.fromkeys(("l", "\x1b[C"), 1.0),
+    **dict.fromkeys(("h", "\x1b[D"), -1.0),
+    **dict.fromkeys(("0", "\x1b[H", "\x1b[1~"), -math.inf),
+    **dict.fromkeys(("$", "\x1b[F", "\x1b[4~"), math.inf),
 }
-
-
-_MOVES: dict[str, Callable[[int, int], int]] = {
-    "l": lambda t, _: t + 1,
-    "h": lambda t, _: t - 1,
-    "0": lambda _, __: 0,
-    "$": lambda _, last: last,
-}
-"""Key -> the step that it leads to, of the present one and the last."""
+"""Key, a letter or an escape sequence -> how many steps it leads on, within the episode."""
 
 
 @dataclass
@@ -126,13 +117,13 @@ class Playing:
 
     def press(self, key: str) -> None:
         """Do the action of a key."""
-        key, last = _ESCAPES.get(key, key), self.steps - 1
+        last = self.steps - 1
         if key == " ":
             self.paused = not self.paused
             if not self.paused and self.t == last:
                 self.t = 0
         elif key in _MOVES:
-            self.paused, self.t = True, min(max(_MOVES[key](self.t, last), 0), last)
+            self.paused, self.t = True, int(min(max(self.t + _MOVES[key], 0), last))
         elif key in ("+", "-"):
             self.speed = min(max(self.speed * (2 if key == "+" else 0.5), 0.25), 256)
         elif key in ("q", "\x1b", "\x03"):
