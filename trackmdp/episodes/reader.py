@@ -16,7 +16,7 @@ from tensordict import TensorDict
 from trackmdp.config import train_config_of
 from trackmdp.episodes import schema
 from trackmdp.episodes.container import Container, Damaged, Said, reading
-from trackmdp.episodes.episode import Recording, first_difference
+from trackmdp.episodes.episode import first_difference
 from trackmdp.episodes.schema import LoggedRun, versions_apart
 from trackmdp.episodes.simulate import resimulate
 from trackmdp.episodes.written import form_of
@@ -211,28 +211,20 @@ def verify(reader: EpisodeReader, *, numbers: list[int] | None = None) -> Verifi
     """
     if numbers is None:
         reader.check_all()
-    wanted = [row["episode"] for row in reader.rows] if numbers is None else numbers
+    rows = reader.rows if numbers is None else [reader.row(number) for number in numbers]
     # The belief is a sum of products, which another version or processor may add up in another order.
     tolerance = BELIEF_TOLERANCE if versions_apart(reader.run.said) else 0.0
     world, done, steps = reader.world(), 0, 0
-    for number_of_policy, group in groupby(wanted, lambda number: reader.row(number)["policy"]):
-        policy, mine = reader.policy(number_of_policy), list(group)
+    for number, group in groupby(rows, lambda row: row["policy"]):
+        policy, mine = reader.policy(number), list(group)
         for begin in range(0, len(mine), _AT_ONCE):
-            for number, again in _again(reader, world, policy, mine[begin : begin + _AT_ONCE]):
-                logged = reader.read(number)
-                if difference := first_difference(logged, again, belief_tolerance=tolerance):
-                    return Verified(done, steps, f"episode {number}, {difference}")
+            some = mine[begin : begin + _AT_ONCE]
+            again = resimulate(world, policy, [int(row["seed"]) for row in some]).complete()
+            for row, one in zip(some, again, strict=True):
+                logged = reader.read(row["episode"])
+                # A simulated episode does not know under which policy it was logged.
+                mended = replace(one, policy=row["policy"])
+                if difference := first_difference(logged, mended, belief_tolerance=tolerance):
+                    return Verified(done, steps, f"episode {row['episode']}, {difference}")
                 done, steps = done + 1, steps + len(logged)
     return Verified(done, steps, None)
-
-
-def _again(
-    reader: EpisodeReader, world: Problem | Group, policy: Policy | Rule, numbers: list[int]
-) -> Iterator[tuple[int, Recording]]:
-    rows = [reader.row(number) for number in numbers]
-    again: Any = resimulate(world, policy, [int(row["seed"]) for row in rows]).complete()
-    # Simulated episodes do not know under which number and policy they were logged.
-    return (
-        (row["episode"], replace(one, policy=row["policy"]))
-        for row, one in zip(rows, again, strict=True)
-    )
