@@ -175,6 +175,38 @@ def test_unknown_cells_are_drawn_as_the_kernel_explains_them() -> None:
         assert whole.count(path) > 0.4 * len(whole)
 
 
+def pieces(tracks: Tracks) -> list[tuple[int, ...]]:
+    """The cells of each track that exits."""
+    each = np.split(tracks.cells, tracks.first[1:-1])
+    return [tuple(cells) for cells, exits in zip(each, tracks.exits.tolist(), strict=True) if exits]
+
+
+def test_unknown_cells_follow_the_heading() -> None:
+    """From 4 the target goes right or down, whichever it did before; by the cell alone half of the draws are wrong."""
+    paths = [[3, 4, 5, 8], [1, 4, 7, 8]]
+    task = replace(recorded(by_hand(*paths * 40)), detection=0.6, markov=False)
+    made = SensedPaths(task)
+    made.extend(collect(task, Policy.all_on(task), 256, 40))
+    found = pieces(made.tracks())
+    assert sum(list(path) in paths for path in found) > 0.98 * len(found)
+
+
+@pytest.mark.parametrize("cut", [1, 7, 40])
+def test_misses_of_the_safe_action_are_steps(cut: int) -> None:
+    """The one path there is comes whole out of its pieces, however often the safe action missed on it."""
+    path = (0, 1, 2, 5, 8, 7, 6, 3)
+    task = replace(recorded(by_hand(list(path))), detection=0.5, safe_detection=0.4, markov=False)
+    made = SensedPaths(task)
+    for batch in collect(task, Policy.all_on(task), 64, 40).split(cut, dim=1):
+        made.extend(batch)
+        again = SensedPaths(task)
+        again.load_state_dict(made.state_dict())
+        made = again
+    found = pieces(made.tracks())
+    assert len(found) > 200
+    assert set(found) == {path}
+
+
 def test_only_observations_are_read() -> None:
     """Rewards, and sets of steps without a miss, are not."""
     batch = collect(SETTING, Policy.all_on(SETTING), 16, 40)

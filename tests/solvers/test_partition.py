@@ -80,6 +80,16 @@ def test_with_the_default_halo_blocks_lose_nothing_and_without_one_they_do(
     assert lost <= stated + 5e-5
 
 
+def test_blocks_are_certified_where_the_whole_grid_is() -> None:
+    """The clocked bound is .56 a step above the best policy there is: the rest is proved by the whole grid's search."""
+    world = tm.make_world("random_walk", size=10, cost=0.4, safe_cost=8)
+    whole, parts = tm.solve(world), tm.solve(world, block=5)
+    assert whole.certified
+    assert parts.certified
+    assert parts.lower == pytest.approx(whole.lower, abs=1e-6 * abs(whole.lower))
+    assert not tm.solve(world, block=5, sweeps=0).certified  # the blocks alone
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:partition.halo=0")
 def test_sweeps_over_the_whole_grid_mend_what_blocks_cannot() -> None:

@@ -22,8 +22,8 @@ from trackmdp.algos.common import arrays, known_alone, lifted, located, tensors
 from trackmdp.algos.estimates.alike import cell_classes
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.estimates.path_counts import plan_paths
-from trackmdp.algos.estimates.path_gains import Paths
-from trackmdp.algos.estimates.path_plans import UNJUDGED, choose_plan
+from trackmdp.algos.estimates.path_gains import Paths, thinned
+from trackmdp.algos.estimates.path_plans import TRIED, UNJUDGED, choose_plan
 from trackmdp.algos.estimates.second_order import displacements, second_order
 from trackmdp.algos.estimates.shrinkage import believed_world, least_worth_planning
 from trackmdp.algos.observed import SensedPaths, observed_paths
@@ -147,8 +147,9 @@ class ModelBased:
         task, cfg, tracks = self.task, self.cfg, self._paths.tracks()
         if last and cfg.prior is None:
             others = [self._pooled] if self._compares else []
-            states = task.num_cells * len(displacements(task, tracks))
-            if self._compares and task.num_cells < states <= _MOST_STATES:
+            seen = len(displacements(task, *tracks.steps(task.num_cells)))
+            states = 2 * task.num_cells * seen
+            if self._compares and seen > 1 and states <= _MOST_STATES:
                 others.append(self._after_moves)
             found = choose_plan(
                 task,
@@ -159,7 +160,8 @@ class ModelBased:
                 seed=self._seed,
             )
         else:
-            paths = Paths(task, tracks, cfg.gamma)
+            some = tracks if last else thinned(task, tracks, TRIED, self._seed)
+            paths = Paths(task, some, cfg.gamma)
             prior = UNJUDGED * paths.copies if cfg.prior is None else cfg.prior
             found = plan_paths(paths, prior=prior, rounds=cfg.rounds)
         moves = max(len(tracks.cells) - len(tracks), 1)

@@ -16,16 +16,19 @@ from torch import Tensor
 
 from trackmdp.algos.common import arrays, tensors
 from trackmdp.algos.estimates.censored import ObservedPaths, hidden_cells
+from trackmdp.algos.estimates.hidden_cells import Missed, redrawn
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.moves import known_as
 from trackmdp.solvers.linear import IndexArray
 from trackmdp.world.coverage import reported
 from trackmdp.world.model import Array, BoolArray, Task
-from trackmdp.world.tracks import Tracks, ends_of
+from trackmdp.world.tracks import Indices, Tracks, ends_of
 from trackmdp.world.windows import Window
 
 _ENDING = 8
 """Cells at the end of a path that identify its recording: wherever a path began, it ends as its recording."""
+_LONGEST_WAIT = 16
+"""Misses of the safe action up to which the cells in between are inferred."""
 EM_ROUNDS = 20
 """Rounds of expectation-maximisation, from the moves seen alone: the result does not depend on earlier ones."""
 
@@ -34,12 +37,12 @@ def observed_paths(batch: TensorDictBase, task: Task, *, last: bool = False) -> 
     """The paths that end in a collected batch `[B, time]`, row by row.
 
     Where a detection reveals the mode they are of keys, and a sensor sees all those of its cell. Where the safe action
-    may miss, a path that comes to it ends with its last set.
+    may miss, a path that comes to it ends with its last set, unless `last`.
 
     Args:
         batch: of any sets.
         task: its sensors.
-        last: whether cells are wanted where there are keys.
+        last: whether cells are wanted where there are keys, and where a path ends however often the safe action missed.
     """
     after, name = batch["next"], "last_cell" if last else known_as(batch)
     outside, classes = (task.num_cells, 1) if last else (task.num_keys, task.keys.num_classes)
@@ -47,7 +50,7 @@ def observed_paths(batch: TensorDictBase, task: Task, *, last: bool = False) -> 
     exited = after["terminated"].squeeze(-1)
     cell, misses = (batch[key][ended] for key in ("last_cell", "steps_since_detection"))
     end = torch.where(exited, outside, after[name])[ended]
-    if not task.safe:
+    if not (task.safe or last):
         end = torch.where(misses == task.num_choices, outside + 1, end)
     # A path's sets are in the history of the step that ended it, wherever the batch began. Most paths have no miss.
     missed = misses.nonzero().squeeze(-1)
@@ -76,6 +79,30 @@ def path_ends(batch: TensorDictBase) -> Tensor:
     return located | after["terminated"].squeeze(-1)
 
 
+def _waits(
+    batch: TensorDictBase, choices: int, before: IndexArray
+) -> tuple[IndexArray, IndexArray]:
+    """`[K]` misses of the safe action on each path that ends in a batch, and `[B]` safe actions of those that do not.
+
+    Example: with the flags 1 1 0 1 of safe actions, of which the second and the last one locate, and one safe action
+    before the batch, the waits are 2 and 0.
+
+    Args:
+        batch: `[B, time]`.
+        choices: T_max + 1.
+        before: `[B]` safe actions of each row's path before the batch; a large negative number where unknown.
+    """
+    forced = (batch["steps_since_detection"] == choices).cpu().numpy()
+    ended = path_ends(batch).cpu().numpy()
+    ends = ended | batch["next", "done"].squeeze(-1).cpu().numpy()
+    taken = forced.cumsum(axis=1)
+    # Safe actions until the last end, none of them yet: those before the batch count on.
+    base = np.maximum.accumulate(np.where(ends, taken, 0), axis=1)
+    base = np.where(np.logical_or.accumulate(ends, axis=1), base, -before[:, None])
+    since = taken - np.concatenate([-before[:, None], base[:, :-1]], axis=1)
+    return np.where(forced, since - 1, 0)[ended], taken[:, -1] - base[:, -1]
+
+
 class SensedPaths:
     """Whole paths put together from batches, each row continuing the last.
 
@@ -92,6 +119,12 @@ class SensedPaths:
         self._task, self._capacity, self._seed = task, capacity, seed
         self._parts: list[ObservedPaths] = []
         self._episodes: list[IndexArray] = []
+        self._waits: list[
+            IndexArray
+        ] = []  # misses of the safe action on each path, < 0 where unknown
+        self._waiting: IndexArray = np.zeros(
+            0, dtype=np.int64
+        )  # [B], safe actions of each row's unfinished path
         self._running = np.zeros(0, dtype=np.int64)  # [B], number of the episode of each row
         self._next = 0
         self._tracks: Tracks | None = None
@@ -109,6 +142,9 @@ class SensedPaths:
         if not self._continued(row, begun[row, time], paths.start, len(done)):
             self._running = self._next + np.arange(len(done))
             self._next += len(done)
+            # Where a row begins with a safe action, nobody knows how many missed before.
+            forced = batch["steps_since_detection"][:, 0] == self._task.num_choices
+            self._waiting = np.where(forced.cpu().numpy(), -batch.shape[-1] - 1, 0)
         # Later episodes get new numbers: row by row, for the ones that begin in this batch.
         ends = done.sum(axis=1)
         base = self._next + np.cumsum(ends) - ends
@@ -117,9 +153,11 @@ class SensedPaths:
         self._next += int(ends.sum())
         self._parts.append(paths)
         self._episodes.append(number[row, time])
+        waits, self._waiting = _waits(batch, self._task.num_choices, self._waiting)
+        self._waits.append(waits)
         self._tracks = None
         while self._capacity is not None and len(self) > self._capacity and len(self._parts) > 1:
-            del self._parts[0], self._episodes[0]
+            del self._parts[0], self._episodes[0], self._waits[0]
 
     def _continued(self, row: IndexArray, begun: IndexArray, start: IndexArray, rows: int) -> bool:
         """Whether every row goes on as the batch before ended; not so where workers deliver in any order."""
@@ -146,12 +184,18 @@ class SensedPaths:
         return self._tracks
 
     def _joined(self) -> Tracks:
-        task, cells = self._task, self._task.num_cells
+        cells = self._task.num_cells
         episode = np.concatenate(self._episodes)
         order = np.argsort(episode, kind="stable")
-        paths = ObservedPaths.of(self._parts, cells).pick(order)
-        known = paths.end <= cells  # else nothing is known of where the target went
+        paths, waits = (
+            ObservedPaths.of(self._parts, cells).pick(order),
+            np.concatenate(self._waits)[order],
+        )
+        known = (waits >= 0) & (
+            waits <= _LONGEST_WAIT
+        )  # else nothing is known of where the target went
         paths, episode = paths.pick(np.flatnonzero(known)), episode[order][known]
+        paths = paths.waiting(waits[known])
         begins = np.ones(len(episode), dtype=bool)
         begins[1:] = (np.diff(episode) != 0) | (paths.end[:-1] != paths.start[1:])
         # A path adds its hidden cells and its end, the first one of a track its start as well.
@@ -160,13 +204,9 @@ class SensedPaths:
         line[first[:-1][begins]] = paths.start[begins]
         line[first[1:] - 1] = paths.end
         seen = line >= 0
-        if not seen.all():
-            estimate = KernelEstimate(task.size, weight=1.0, exit_weight=1.0, share_cells=None)
-            estimate.add(paths)
-            estimate.fit(EM_ROUNDS)
-            rng = np.random.default_rng(self._seed)
-            line[~seen] = hidden_cells(estimate.mean(), paths, rng)
         track = np.repeat(np.cumsum(begins) - 1, np.diff(first))
+        if not seen.all():
+            line = self._filled(paths, line, ends_of(np.bincount(track)))
         inside = line < cells
         exits = np.zeros(int(begins.sum()), dtype=bool)
         exits[track[~inside]] = True
@@ -175,6 +215,20 @@ class SensedPaths:
         names = _recordings(line, seen, ends).astype(np.int64)
         return Tracks(line, ends, exits, names)
 
+    def _filled(self, paths: ObservedPaths, line: Indices, first: Indices) -> IndexArray:
+        """The cells of whole paths that begin at places `first`, those that are -1 drawn."""
+        task, unknown = self._task, line < 0
+        estimate = KernelEstimate(task.size, weight=1.0, exit_weight=1.0, share_cells=None)
+        estimate.add(paths)
+        estimate.fit(EM_ROUNDS)
+        rng = np.random.default_rng(self._seed)
+        line[unknown] = hidden_cells(estimate.mean(), paths, rng)
+        if task.markov:
+            return line
+        count = len(first) - 1
+        tracks = Tracks(line, first, np.ones(count, dtype=bool), np.arange(count))
+        return redrawn(task, tracks, unknown, _missed(paths), rng)
+
     def state_dict(self) -> dict[str, Any]:
         """All that was observed."""
         paths = ObservedPaths.of(self._parts, self._task.num_cells)
@@ -182,6 +236,8 @@ class SensedPaths:
         numbers = {
             "sizes": np.array(sizes, dtype=np.int64),
             "episodes": np.concatenate([np.zeros(0, dtype=np.int64), *self._episodes]),
+            "waits": np.concatenate([np.zeros(0, dtype=np.int64), *self._waits]),
+            "waiting": self._waiting,
             "running": self._running,
             "next": np.array([self._next]),
         }
@@ -194,9 +250,26 @@ class SensedPaths:
         paths = ObservedPaths.of_state(each, self._task.num_cells)
         places = np.split(np.arange(len(paths.start)), ends[:-1]) if len(ends) else []
         self._parts = [paths.pick(place) for place in places]
-        self._episodes = [each["episodes"][place] for place in places]
+        self._episodes, self._waits = (
+            [each[name][place] for place in places] for name in ("episodes", "waits")
+        )
+        self._waiting = each["waiting"].copy()
         self._running, self._next = each["running"].copy(), int(each["next"][0])
         self._tracks = None
+
+
+def _missed(paths: ObservedPaths) -> Missed:
+    """The probability that no sensor of its set reported each hidden cell of the paths, path by path."""
+    misses = paths.misses.astype(np.int64)
+    path = np.repeat(np.arange(len(misses)), misses)
+    miss = np.arange(len(path)) - ends_of(misses)[path]
+    sensed = sparse.csr_array(paths.sensed[path * paths.choices + miss])
+
+    def missed(number: IndexArray, cells: IndexArray) -> Array:
+        row = np.broadcast_to(number[:, None], cells.shape)
+        return 1.0 - np.asarray(sensed[row.ravel(), cells.ravel()]).reshape(cells.shape)
+
+    return missed
 
 
 def _recordings(line: Array, seen: BoolArray, first: IndexArray) -> IndexArray:

@@ -76,7 +76,9 @@ def detected_codes(keys: KeySpace, key: IndexArray, state: IndexArray) -> npt.ND
 def forced_codes(
     keys: KeySpace, states: int, key: IndexArray | None, state: IndexArray
 ) -> npt.NDArray[np.int64]:
-    """`[E]`, see `Events`; without `key`, as the next one does not depend on it, it counts as 0."""
+    """`[E]`, see `Events`; what the next key does not depend on counts as 0, without `key` all of it."""
+    if key is not None and keys.order == 1:  # the next one depends on the last located cell alone
+        key = keys.start(keys.cell(key))
     return (state.astype(np.int64) + states) * keys.num_keys + (0 if key is None else key)
 
 

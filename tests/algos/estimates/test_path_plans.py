@@ -12,7 +12,7 @@ from scipy import sparse
 from tests.algos.estimates.test_path_counts import planned
 from tests.tracks import by_hand, recorded
 from trackmdp.algos.estimates.path_counts import KeyPlans, along, interleaved
-from trackmdp.algos.estimates.path_gains import AlongPaths, Paths
+from trackmdp.algos.estimates.path_gains import AlongPaths, Paths, thinned
 from trackmdp.algos.estimates.path_plans import PRIORS, choose_plan, exchanged_keys, parted
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.value import replay
@@ -133,13 +133,23 @@ def test_the_choice_is_the_one_that_earns_most_where_it_is_judged() -> None:
     """Of what is tried, all weights and then exchange, none earns more on the paths that judge."""
     tracks, judge = line_walks(5, count=30), line_walks(5, count=31).select(np.arange(31) > 20)
     task = recorded(tracks, memory="displacement", clip=1)
-    found = choose_plan(task, tracks, judge=judge, discount=1.0, rounds=5)
-    for prior in PRIORS:
-        other = planned(task, tracks, prior=prior, discount=1.0, rounds=5)
+    known = planned(task, judge, prior=0.0, discount=1.0, rounds=5).policy
+    found = choose_plan(task, tracks, judge=judge, others=[lambda _: known], discount=1.0, rounds=5)
+    others = [planned(task, tracks, prior=each, discount=1.0, rounds=5).policy for each in PRIORS]
+    for other in (known, *others):
         assert (
             replay(task, judge, found.policy).totals[:, 0].sum()
-            >= replay(task, judge, other.policy).totals[:, 0].sum()
+            >= replay(task, judge, other).totals[:, 0].sum()
         )
+
+
+def test_some_of_many_paths_have_as_many_events_as_asked_for() -> None:
+    tracks = line_walks(2, count=400)
+    task = recorded(tracks, memory="displacement", clip=1)
+    events = Paths(task, tracks, 1.0).renewal.count
+    some = Paths(task, thinned(task, tracks, events // 4, 0), 1.0).renewal.count
+    assert events / 5 < some < events / 3
+    assert thinned(task, tracks, 2 * events, 0) is tracks
 
 
 def test_where_all_paths_are_one_there_is_nothing_to_choose_by() -> None:

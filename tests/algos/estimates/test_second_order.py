@@ -7,7 +7,13 @@ import pytest
 from scipy import sparse
 
 import trackmdp as tm
-from trackmdp.algos.estimates.second_order import displacements, second_order
+from tests.tracks import by_hand
+from trackmdp.algos.estimates.second_order import (
+    displacements,
+    heading_after,
+    headings,
+    second_order,
+)
 from trackmdp.world.tracks import Tracks
 
 TASK = tm.World(np.full((3, 3), 0.3), (1, 3), cost=0.16, t_max=1, memory="displacement")
@@ -19,28 +25,39 @@ POOLED = sparse.csr_array([[0, 0.5, 0, 0.5], [0.5, 0, 0.5, 0], [0.25, 0.25, 0, 0
 
 
 def test_moves_after_a_cell_and_a_move_are_counted_and_the_pooled_ones_count_as_three() -> None:
-    """States: cell, move (left, right). From cell 1 after a move to the right: (1 + 1.5) / 4 right, 1.5 / 4 left.
+    """States: cell, and twice the place of the last move among (left, stop, right), one more after a stop.
 
-    The move of two cells from cell 2, which was never seen, is left out.
+    From cell 1 after a move to the right: (1 + 1.5) / 4 right, 1.5 / 4 left. The move of two cells from cell 2, which
+    was never seen, is left out.
     """
     world = second_order(TASK, TRACKS, POOLED, 0.0)
-    assert (world.modes, world.memory, world.revealed) == (2, "displacement", 1)
-    left, right = (0, 2, 4), (1, 3, 5)
-    expected = np.zeros((6, 6))
-    expected[[left[0], right[0]], right[1]] = 0.5
+    assert (world.modes, world.memory, world.revealed) == (6, "displacement", 1)
+    left, right = (0, 6, 12), (4, 10, 16)
+    expected = np.zeros((18, 18))
+    expected[:6, right[1]] = 0.5
+    expected[6:12, [left[0]]] = expected[6:12, [right[2]]] = 0.5
     expected[left[1], [left[0], right[2]]] = [0.625, 0.375]
     expected[right[1], [left[0], right[2]]] = [0.375, 0.625]
-    expected[left[2], left[1]] = 0.25
+    expected[12:, left[1]] = 0.25
     expected[right[2], left[1]] = 0.75 / 4  # the exit was seen once
     assert world.kernel.toarray() == pytest.approx(expected)
 
 
+def test_a_stop_keeps_the_last_move_and_is_known() -> None:
+    """0 1 1 2 and 2 2: no move, right, right and a stop, right; no move, no move and a stop."""
+    line = by_hand([0, 1, 1, 2], [2, 2])
+    moves = displacements(TASK, *line.steps(3))
+    assert headings(TASK, line, moves).tolist() == [0, 2, 3, 2, 0, 1]
+    assert heading_after(
+        TASK, moves, np.array([2, 2]), np.array([1, 1]), np.array([1, 2])
+    ).tolist() == [3, 2]
+
+
 def test_displacements_are_those_seen() -> None:
-    """One cell to the left and to the right; on two rows, up and to the right are two moves."""
-    assert len(displacements(TASK, TRACKS)) == 2
+    """A stop, one cell to the left and to the right; on two rows, up and to the right are two moves."""
+    assert len(displacements(TASK, *TRACKS.steps(3))) == 3
     square = tm.make_world("random_walk", size=3)
-    path = Tracks(np.array([3, 0, 1]), np.array([0, 3]), np.array([True]), np.arange(1))
-    assert len(displacements(square, path)) == 2
+    assert len(displacements(square, np.array([3, 0]), np.array([0, 1]))) == 3
 
 
 @pytest.mark.slow

@@ -56,6 +56,20 @@ class ObservedPaths:
             self.start[paths], self.misses[paths], self.sensed[rows], self.end[paths]
         )
 
+    def waiting(self, waits: IndexArray) -> ObservedPaths:
+        """The paths with so many misses more, `[K]`, which tell nothing."""
+        if not waits.any():
+            return self
+        more = int(waits.max())
+        lengths = np.diff(self.sensed.indptr).reshape(-1, self.choices)
+        wide = np.pad(lengths, ((0, 0), (0, more))).ravel()
+        pointer = np.concatenate([[0], np.cumsum(wide)])
+        sensed = sparse.csr_array(
+            (self.sensed.data, self.sensed.indices, pointer),
+            shape=(len(wide), self.sensed.shape[1]),
+        )
+        return ObservedPaths(self.start, self.misses + waits, sensed, self.end)
+
     @classmethod
     def of(cls, parts: Sequence[ObservedPaths], cells: int) -> ObservedPaths:
         """All paths of `parts`, one after the other, on a grid of so many cells."""

@@ -17,6 +17,7 @@ import numpy as np
 from trackmdp.policies.table import SetTable
 from trackmdp.solvers.linear import IndexArray, triangular
 from trackmdp.solvers.renewal import Act, Renewal
+from trackmdp.solvers.walk import all_events
 from trackmdp.world.model import Array, BoolArray, Task
 from trackmdp.world.tracks import Tracks
 
@@ -36,6 +37,10 @@ class AlongPaths:
     visits: Array
     gain: list[Array]
     value: Array
+
+
+_SAMPLE = 100
+"""Tracks by which the events of all of them are reckoned."""
 
 
 class Paths:
@@ -110,12 +115,33 @@ class Paths:
         return gains
 
 
+def thinned(task: Task, tracks: Tracks, most: int, seed: int) -> Tracks:
+    """Random ones of the tracks with about `most` events, equal ones together; all where there are no more.
+
+    Where a safe action misses again and again, a point may follow from many before it.
+    """
+    groups = _groups(tracks)
+    order = np.random.default_rng(seed).permutation(groups.max(initial=-1) + 1)
+    each, _ = different(tracks)
+    some = each.select(np.isin(np.arange(len(each)), order[:_SAMPLE]))
+    events = len(all_events(task, task.keys, some.motion()).codes)
+    share = most * len(some.cells) / (max(events, 1) * max(len(each.cells), 1))
+    return (
+        tracks if share >= 1 else tracks.select(np.isin(groups, order[: int(share * len(order))]))
+    )
+
+
 def different(tracks: Tracks) -> tuple[Tracks, IndexArray]:
     """The tracks that differ in where they lead, `[K]` of them, and how often each is there."""
-    number: dict[tuple[bytes, bool], int] = {}
-    pieces = zip(np.split(tracks.cells, tracks.first[1:-1]), tracks.exits.tolist(), strict=True)
-    each = [number.setdefault((cells.tobytes(), leaves), len(number)) for cells, leaves in pieces]
-    _, first, times = np.unique(each, return_index=True, return_counts=True)
+    _, first, times = np.unique(_groups(tracks), return_index=True, return_counts=True)
     chosen: BoolArray = np.zeros(len(tracks), dtype=bool)
     chosen[first] = True
     return tracks.select(chosen), times
+
+
+def _groups(tracks: Tracks) -> IndexArray:
+    """`[K]`, one number for all tracks that lead to the same cells, in the order in which they first come."""
+    number: dict[tuple[bytes, bool], int] = {}
+    pieces = zip(np.split(tracks.cells, tracks.first[1:-1]), tracks.exits.tolist(), strict=True)
+    each = [number.setdefault((cells.tobytes(), leaves), len(number)) for cells, leaves in pieces]
+    return np.array(each, dtype=np.int64)

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from scipy import sparse
 
 from trackmdp.algos.estimates.path_counts import KeyPlans, Planned, along, interleaved, plan_paths
-from trackmdp.algos.estimates.path_gains import AlongPaths, Paths
+from trackmdp.algos.estimates.path_gains import AlongPaths, Paths, thinned
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers.exchange import exchange
@@ -36,6 +35,8 @@ _ROUNDS, _LEAST_SHARE, _RISE = 30, 1 / 64, 1e-5
 """Rounds of exchange at most, the smallest share of the keys that are changed at once, and the least rise of reward."""
 _SEARCHED = 2
 """The best plans, which exchange begins from."""
+TRIED, _MOST = 200_000, 600_000
+"""Events on which plans are tried, and on which the best are searched: few, as a round takes a second for a million."""
 _JUDGED = 0.25
 """Share of the recordings that judge, where no others are there for it."""
 
@@ -59,40 +60,55 @@ def choose_plan(
         judge: validation paths; None: paths that `parted` draws from `tracks`, which do not count until all is
             chosen.
         priors: weights of the prior that are tried.
-        others: from paths to policies from which policy iteration begins as well.
+        others: from paths to policies that are tried as they are, and from which policy iteration begins as well.
         discount: γ of the credit.
         rounds: of policy iteration at most.
         seed: of the draw, where there is one.
     """
     counted, judge = parted(tracks, seed) if judge is None else (tracks, judge)
-
-    def prior_plan(paths: Paths, prior: float) -> Planned:
-        # A recording that was followed ten times is no more evidence than once.
-        return plan_paths(paths, prior=prior * paths.copies, rounds=rounds)
-
-    def other_plan(paths: Paths, make: Callable[[Tracks], PolicyTable]) -> Planned:
-        start = KeyPlans.of_table(make(counted), paths.keys)
-        return plan_paths(paths, prior=UNJUDGED * paths.copies, rounds=rounds, start=start)
-
-    tries = [partial(prior_plan, prior=prior) for prior in priors]
-    tries += [partial(other_plan, make=make) for make in others]
+    weights = [*priors, *(UNJUDGED for _ in others)]
     if not len(judge):  # nothing to choose by
         paths = Paths(task, tracks, discount)
-        return plan_paths(paths, prior=UNJUDGED, rounds=rounds) if priors else tries[0](paths)
-    paths, judged = Paths(task, counted, discount), Paths(task, judge, discount)
-    plans = [make(paths) for make in tries]
-    scores = [along(judged, each.plans).reward for each in plans]
-    order = np.argsort(scores, kind="stable")[::-1][:_SEARCHED].tolist()
-    searched = [_searched(paths, plans[place]) for place in order]
-    gains = [along(judged, each.plans).reward for each in searched]
-    exchanges = gains[best := int(np.argmax(gains))] > scores[order[0]]
-    place, final = (order[best], searched[best]) if exchanges else (order[0], plans[order[0]])
+        if priors:
+            return plan_paths(paths, prior=UNJUDGED, rounds=rounds)
+        return _improved(paths, UNJUDGED, rounds, KeyPlans.of_table(others[0](tracks), paths.keys))
+    little, enough = (thinned(task, counted, most, seed) for most in (TRIED, _MOST))
+    paths = Paths(task, enough, discount)
+    few = paths if little is enough else Paths(task, little, discount)
+    judged = Paths(task, thinned(task, judge, _MOST, seed), discount)
+    tried = [_improved(few, prior, rounds).plans for prior in priors]
+    tried += [KeyPlans.of_table(make(counted), few.keys) for make in others]
+    order = _ranked(judged, tried)[:_SEARCHED]
+    better = [_improved(paths, weights[place], rounds, tried[place]) for place in order]
+    plans = [*(tried[place] for place in order), *(each.plans for each in better)]
+    plans += [_searched(paths, each).plans for each in better]
+    best = _ranked(judged, plans)[0]
     if counted is tracks:
-        return final
-    whole = Paths(task, tracks, discount)  # from the plan that was chosen
-    prior = (*priors, *(UNJUDGED for _ in others))[place] * whole.copies
-    planned = plan_paths(whole, prior=prior, rounds=rounds, start=final.plans.on(whole.keys))
-    return _searched(whole, planned) if exchanges else planned
+        return _valued(paths, plans[best].on(paths.keys))
+    stage, place = best // len(order), order[best % len(order)]
+    whole = Paths(task, thinned(task, tracks, _MOST, seed), discount)
+    if stage == 0 and place >= len(priors):  # as it was made
+        return _valued(whole, KeyPlans.of_table(others[place - len(priors)](tracks), whole.keys))
+    last = _improved(whole, weights[place], rounds, plans[best])  # from the plan that was chosen
+    return _searched(whole, last) if stage == 2 else last
+
+
+def _improved(paths: Paths, prior: float, rounds: int, start: KeyPlans | None = None) -> Planned:
+    """Policy iteration, from `start` if there is one."""
+    start = None if start is None else start.on(paths.keys)
+    # A recording that was followed ten times is no more evidence than once.
+    return plan_paths(paths, prior=prior * paths.copies, rounds=rounds, start=start)
+
+
+def _ranked(judged: Paths, plans: Sequence[KeyPlans]) -> list[int]:
+    """The places of plans, the one that earns most on the judging paths first."""
+    earned = np.array([along(judged, each).reward for each in plans])
+    return np.argsort(-earned, kind="stable").tolist()
+
+
+def _valued(paths: Paths, plans: KeyPlans) -> Planned:
+    """Plans with their reward on paths."""
+    return Planned(plans, along(paths, plans).reward, len(paths.keys), 0)
 
 
 def parted(tracks: Tracks, seed: int) -> tuple[Tracks, Tracks]:

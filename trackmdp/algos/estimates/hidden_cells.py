@@ -1,0 +1,149 @@
+"""Unknown cells of whole paths, drawn where the next move depends on the cell and on the last move.
+
+A kernel of the cell alone takes an unknown step of a target that keeps its heading for a turn as often as not. Gibbs
+sampling draws each unknown cell given the cells around it, and counts the moves anew after each sweep (stochastic
+expectation-maximisation, Celeux and Diebolt 1985). What a stop tells of moves three steps later is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from trackmdp.algos.estimates.second_order import displacements, heading_after, headings, shift
+from trackmdp.solvers.linear import IndexArray
+from trackmdp.world.model import Array, BoolArray, Task
+from trackmdp.world.tracks import Tracks
+
+_SWEEPS = 20
+_WEIGHT = 3.0
+"""Moves as many as which the motion of the cell counts in the motion after a cell and a move."""
+_MOST_MOVES = 50
+"""Displacements up to which cells are drawn so: where targets leap far, the last move tells little."""
+_LEAP = 1e-6
+"""Probability of any other move: guesses that no draw would hold for possible can be left one by one."""
+_AT_ONCE = 2**21
+"""Unknown cells times displacements worked on at once: some 20 MB an array."""
+
+Missed: TypeAlias = Callable[[IndexArray, IndexArray], Array]
+"""From numbers of unknown cells `[K]` and cells `[K, H]` to the probability of a miss there, `[K, H]`."""
+
+
+def redrawn(
+    task: Task, line: Tracks, unknown: BoolArray, missed: Missed, rng: np.random.Generator
+) -> IndexArray:
+    """`[P]` cells of tracks, M after an exit, the `unknown` ones drawn anew; no track begins or ends with one.
+
+    Example: on cells in a row a target that came from 2 to 3 is located in 5 two steps later. It was in 4 then if it
+    keeps its heading, in 3 if it stopped and then leapt.
+
+    Args:
+        task: its grid.
+        line: the tracks, with first guesses.
+        unknown: `[P]`.
+        missed: probability that the target was not reported, by numbers among the unknown cells.
+        rng: of the draws.
+    """
+    at, line = np.flatnonzero(unknown), replace(line, cells=line.cells.copy())
+    for _ in range(_SWEEPS):
+        moves = _Moves.of(task, line, unknown)
+        if len(moves.moves) > _MOST_MOVES:
+            break
+        # A draw looks at the next two cells: every third one is drawn at once.
+        for turn in range(3):
+            own = np.flatnonzero(at % 3 == turn)
+            mode = headings(task, line, moves.moves)
+            for part in np.array_split(own, 1 + len(own) * len(moves.moves) // _AT_ONCE):
+                place = at[part]
+                chance = moves.likelihood(line, mode, place)
+                chance *= missed(part, moves.candidates(line.cells[place - 1])[0])
+                line.cells[place] = moves.picked(line, place, chance, rng.random(len(place)))
+    return line.cells
+
+
+@dataclass(frozen=True)
+class _Moves:
+    """How often cells followed each other on complete tracks.
+
+    Attributes:
+        task: its grid.
+        moves: `[H]`, the `displacements`.
+        counts: codes of a cell (b), with its `headings` (m) and with the next cell (c), in increasing order, and how
+            often each came before a next cell.
+    """
+
+    task: Task
+    moves: IndexArray
+    counts: dict[str, tuple[IndexArray, Array]]
+
+    @classmethod
+    def of(cls, task: Task, line: Tracks, unknown: BoolArray) -> _Moves:
+        """The moves on complete tracks; displacements that were never sensed do not count."""
+        goes_on = np.ones(len(line.cells), dtype=bool)
+        goes_on[line.first[1:] - 1] = False
+        at = np.flatnonzero(goes_on)
+        before, after = line.cells[at], line.cells[at + 1]
+        sensed = ~(unknown[at] | unknown[at + 1])
+        sensed |= not sensed.any()
+        moves = displacements(task, before[sensed], after[sensed])
+        possible = (after == task.num_cells) | np.isin(shift(task, before, after), moves)
+        at, before, after = at[possible], before[possible], after[possible]
+        codes = _codes(task, moves, before, headings(task, line, moves)[at], after)
+        counts = {name: np.unique(each, return_counts=True) for name, each in codes.items()}
+        return cls(
+            task, moves, {name: (code, n.astype(float)) for name, (code, n) in counts.items()}
+        )
+
+    def candidates(self, last: IndexArray) -> tuple[IndexArray, BoolArray]:
+        """`[K, H]` cells that the `moves` lead to from cells `last` `[K]`, and whether they are in the grid."""
+        columns = self.task.columns
+        down, across = np.divmod(self.moves + columns, 2 * columns + 1)
+        row, column = last[:, None] // columns + down, last[:, None] % columns + across - columns
+        inside = (row >= 0) & (row < self.task.rows) & (column >= 0) & (column < columns)
+        return np.where(inside, row * columns + column, 0), inside
+
+    def likelihood(self, line: Tracks, mode: IndexArray, at: IndexArray) -> Array:
+        """`[K, H]` probability of the `candidates` at the places `at` and of the next two cells, but for a factor."""
+        last, after, known = line.cells[at - 1], line.cells[at + 1][:, None], mode[at - 1][:, None]
+        cell, inside = self.candidates(last)
+        place = np.minimum(at + 2, len(line.cells) - 1)
+        ends = np.isin(at + 2, line.first)  # the next cell is the track's last one
+        later, last = line.cells[place][:, None], last[:, None]
+        then = heading_after(self.task, self.moves, known, last, cell)
+        chance = self._chance(last, known, cell) * self._chance(cell, then, after)
+        afterwards = heading_after(self.task, self.moves, then, cell, after)
+        chance *= np.where(ends[:, None], 1.0, self._chance(after, afterwards, later))
+        return chance * inside
+
+    def picked(self, line: Tracks, at: IndexArray, chance: Array, draws: Array) -> IndexArray:
+        """`[K]` cells in proportion to `chance` `[K, H]`; where nothing is possible, those before."""
+        sums = chance.cumsum(axis=1)
+        pick = (draws[:, None] * sums[:, -1:] >= sums).sum(axis=1).clip(max=chance.shape[1] - 1)
+        cell = self.candidates(line.cells[at - 1])[0][np.arange(len(at)), pick]
+        return np.where(sums[:, -1] > 0, cell, line.cells[at])
+
+    def _chance(self, cell: IndexArray, mode: IndexArray, after: IndexArray) -> Array:
+        """Probability of the next cell."""
+        codes = _codes(self.task, self.moves, cell, mode, after)
+        count = {name: _looked_up(*self.counts[name], each) for name, each in codes.items()}
+        alone = count["bc"] / np.maximum(count["b"], 1.0)
+        found: Array = (count["bmc"] + _WEIGHT * alone) / (count["bm"] + _WEIGHT)
+        return found + _LEAP
+
+
+def _codes(
+    task: Task, moves: IndexArray, cell: IndexArray, mode: IndexArray, after: IndexArray
+) -> dict[str, IndexArray]:
+    """One number for each combination of cells and modes; a move that was never seen has a mode of its own."""
+    known, wide = cell * (2 * len(moves) + 2) + mode, task.num_cells + 1
+    return {"b": cell, "bc": cell * wide + after, "bm": known, "bmc": known * wide + after}
+
+
+def _looked_up(codes: IndexArray, counts: Array, wanted: IndexArray) -> Array:
+    """How often the `wanted` codes were counted."""
+    place = np.minimum(np.searchsorted(codes, wanted), len(codes) - 1)
+    found: Array = np.where(codes[place] == wanted, counts[place], 0)
+    return found
