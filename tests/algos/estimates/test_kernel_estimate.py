@@ -184,3 +184,20 @@ def test_a_saved_estimate_goes_on_as_it_was() -> None:
         estimate.add(paths_of(simulated(100, seed=3)))
         estimate.fit(2)
     np.testing.assert_array_equal(first.mean().toarray(), second.mean().toarray())
+
+
+@pytest.mark.parametrize("fits", [0, 1])
+def test_a_state_taken_before_or_after_a_fit_goes_on_with_the_same_bits(fits: int) -> None:
+    early = paths_of([(0, [], 1), (0, [{1}], 3), (1, [], 0), (3, [{0}], 2)])
+    late = paths_of([(0, [], 2), (2, [], 0), (0, [{1, 2}], 0), (3, [], 1)])
+    going, resumed = (KernelEstimate(2, weight=0.1, exit_weight=1.0) for _ in range(2))
+    going.add(early)
+    for _ in range(fits):
+        going.fit(1)
+    resumed.load_state(going.state())
+    for estimate in (going, resumed):
+        estimate.add(late)
+    np.testing.assert_array_equal(resumed.mean().toarray(), going.mean().toarray())
+    for estimate in (going, resumed):
+        estimate.fit(1)
+    np.testing.assert_array_equal(resumed.counts.toarray(), going.counts.toarray())

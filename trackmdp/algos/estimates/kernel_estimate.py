@@ -101,9 +101,10 @@ class KernelEstimate:
         self.counts = self.direct if unfitted else self.counts
 
     def state(self) -> dict[str, np.ndarray]:
-        """All that was observed, and the counts so far, as plain arrays."""
+        """All that was observed, and the counts so far, as plain arrays; none before the first fit."""
         parts = ObservedPaths.of(self._censored, self.num_cells).state()
-        for name, matrix in {"direct": self.direct, "counts": self.counts}.items():
+        fitted = {} if self.counts is self.direct else {"counts": self.counts}
+        for name, matrix in {"direct": self.direct, **fitted}.items():
             parts |= {
                 f"{name}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr")
             }
@@ -116,7 +117,9 @@ class KernelEstimate:
             parts = tuple(state[f"{name}_{part}"].copy() for part in ("data", "indices", "indptr"))
             return sparse.csr_array(parts, shape=self.direct.shape)
 
-        self.direct, self.counts = matrix("direct"), matrix("counts")
+        self.direct = matrix("direct")
+        # Without counts of their own, moves that are added count at once (`add_moves`).
+        self.counts = matrix("counts") if "counts_data" in state else self.direct
         paths = ObservedPaths.of_state(state, self.num_cells)
         self._censored = [paths] if len(paths.start) else []
 
