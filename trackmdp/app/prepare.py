@@ -64,9 +64,12 @@ def prepare(command: str, composed: DictConfig, words: Sequence[str]) -> Prepare
         UserError: an option is not allowed, or the file it names is missing or not as expected.
     """
     cfg = from_hydra(composed, config.ROOTS[command], Path.cwd())
+    resumes = getattr(cfg, "resume", None)
+    if not resumes:
+        refuse_ignored(cfg, by_key(words))
     prepared = check(command, cfg, folder_of(composed, "hydra.run.dir"), words)
     # A run that goes on has a config of its own, which `check` has compared with the words.
-    if not (getattr(cfg, "resume", None) and (prepared.folder / "config.yaml").is_file()):
+    if resumes and not (prepared.folder / "config.yaml").is_file():
         refuse_ignored(cfg, by_key(words))
     return prepared
 
