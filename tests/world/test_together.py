@@ -294,3 +294,15 @@ def test_tracks_of_several_targets_from_a_file(tmp_path: Path) -> None:
 
 
 APART30 = by_hand(*(np.random.default_rng(k).integers(9, size=6).tolist() for k in range(30)))
+
+
+@pytest.mark.parametrize("count", [0, 1.5, "2", 10**9])
+def test_a_wrong_number_of_targets_is_refused(count: Any) -> None:
+    setting = recorded(by_hand([0, 1, 2], [2, 1, 0]))
+    with pytest.raises(UserError, match=f"count={count}: expected an integer from 1 to 1,000"):
+        Group.of_tracks(setting, count)
+
+
+def test_a_world_has_no_tracks_to_be_followed_together() -> None:
+    with pytest.raises(UserError, match="a World, expected Recorded"):
+        Group.of_tracks(tm.make_world(size=3), 2)  # type: ignore[arg-type]

@@ -58,7 +58,15 @@ class Group(Carded):
         """Targets on recorded tracks, `count` at the same time; their moves are predicted by the tracks to learn from.
 
         Tracks whose times overlap are followed together; where the recording has no times, any are (`together`).
+
+        Raises:
+            UserError: `recorded` has no tracks, or `count` is no number of targets; or as of `Group`.
         """
+        if not hasattr(recorded, "tracks"):
+            raise UserError(f"Group.of_tracks: a {type(recorded).__name__}, expected Recorded")
+        if not isinstance(count, (int, np.integer)) or not 1 <= count <= MOST_TARGETS:
+            expected = f"an integer from 1 to {MOST_TARGETS:,}"
+            raise UserError(f"Group.of_tracks: count={count}: expected {expected}")
         kernel = recorded.tracks.kernel(recorded.num_cells)
         return cls([World.of(recorded, kernel)] * count, recorded)
 
