@@ -21,6 +21,9 @@ HEARD = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 _ONE = 2.0
 """Seconds in which two count as one: `timeout` and some schedulers signal the process, and then its group once more."""
 
+_AGAIN = 20.0
+"""Seconds after which a wait for a dead worker is interrupted once more; TorchRL ends the others within ten."""
+
 
 @contextmanager
 def handled(handler: Any, *numbers: signal.Signals) -> Iterator[Mapping[signal.Signals, Any]]:
@@ -101,6 +104,7 @@ class Watch(ExitStack):
         # TorchRL keeps them as `procs`; a collector in this process, or on Ray, has none.
         self._processes: list[Any] = list(getattr(collector, "procs", ()))
         self._waiting = False
+        self._again: threading.Timer | None = None
 
     def __enter__(self) -> Self:
         if self._processes:
@@ -120,6 +124,12 @@ class Watch(ExitStack):
             yield
         finally:
             self._waiting = False
+            if self._again:
+                self._again.cancel()
+
+    def _interrupt(self) -> None:
+        self._waiting = True
+        os.kill(os.getpid(), signal.SIGCHLD)
 
     def _heard(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         # Only while the collector waits: an exception out of a signal handler anywhere else, in the middle of an
@@ -135,6 +145,10 @@ class Watch(ExitStack):
             code = None if process._closed else process.exitcode
             if code is not None:
                 self._waiting = False  # the others end next, when the collector is shut down
+                # The code that was interrupted may have swallowed the exception, and would wait for ever.
+                self._again = threading.Timer(_AGAIN, self._interrupt)
+                self._again.daemon = True
+                self._again.start()
                 how = (
                     f"was killed by {signal.Signals(-code).name}"
                     if code < 0

@@ -10,8 +10,12 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,6 +24,7 @@ import torch
 import trackmdp as tm
 from tests.helpers import train_config
 from tests.training.runs import BUDGET, QUICK, SMALL, assert_same_run, at_iteration, rows, train
+from trackmdp import signals
 from trackmdp.algos.common import make_algorithm
 from trackmdp.errors import Preempted, RunError, UserError
 from trackmdp.signals import Watch
@@ -215,6 +220,22 @@ def test_a_worker_that_is_killed_is_named(
     train(tmp_path, f"collector={collector}", "resume=auto")
     assert saved(tmp_path)[0] == 8
     assert [int(row["iteration"]) for row in rows(tmp_path)] == list(range(1, 9))
+
+
+def test_an_interruption_that_is_swallowed_comes_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(signals, "_AGAIN", 0.05)
+    worker = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(60,))
+    worker.start()
+    watch: Any = Watch(SimpleNamespace(procs=[worker]))  # type: ignore[arg-type]
+    with (
+        watch,
+        pytest.raises(RuntimeError, match="worker 0 was killed by SIGKILL"),
+        watch.waiting(),
+    ):
+        with suppress(RuntimeError):
+            worker.kill()
+            threading.Event().wait(60)
+        threading.Event().wait(60)
 
 
 def dies(*_: Any) -> None:
