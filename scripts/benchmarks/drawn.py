@@ -65,9 +65,8 @@ def figures(world: Any, rng: np.random.Generator) -> dict[str, Any]:
     found = [*random.value.tolist(), random.accuracy, random.sensors_per_step]
     if world.max_steps is not None:  # which solvers refuse
         return {"exact": found}
-    if (
-        world.kernel.shape[0] == world.num_cells
-    ):  # with modes the baseline is another one in each package
+    # With modes the baseline is another one in each package.
+    if world.kernel.shape[0] == world.num_cells:
         found.append(tm.solve(world, "qmdp").evaluation.aihtr)
     solved = tm.solve(world)
     return {

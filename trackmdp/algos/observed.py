@@ -119,12 +119,10 @@ class SensedPaths:
         self._task, self._capacity, self._seed = task, capacity, seed
         self._parts: list[ObservedPaths] = []
         self._episodes: list[IndexArray] = []
-        self._waits: list[
-            IndexArray
-        ] = []  # misses of the safe action on each path, < 0 where unknown
-        self._waiting: IndexArray = np.zeros(
-            0, dtype=np.int64
-        )  # [B], safe actions of each row's unfinished path
+        # Misses of the safe action on each path, < 0 where unknown.
+        self._waits: list[IndexArray] = []
+        # [B], safe actions of each row's unfinished path.
+        self._waiting: IndexArray = np.zeros(0, dtype=np.int64)
         self._running = np.zeros(0, dtype=np.int64)  # [B], number of the episode of each row
         self._next = 0
         self._tracks: Tracks | None = None
@@ -187,13 +185,10 @@ class SensedPaths:
         cells = self._task.num_cells
         episode = np.concatenate(self._episodes)
         order = np.argsort(episode, kind="stable")
-        paths, waits = (
-            ObservedPaths.of(self._parts, cells).pick(order),
-            np.concatenate(self._waits)[order],
-        )
-        known = (waits >= 0) & (
-            waits <= _LONGEST_WAIT
-        )  # else nothing is known of where the target went
+        paths = ObservedPaths.of(self._parts, cells).pick(order)
+        waits = np.concatenate(self._waits)[order]
+        # Else nothing is known of where the target went.
+        known = (waits >= 0) & (waits <= _LONGEST_WAIT)
         paths, episode = paths.pick(np.flatnonzero(known)), episode[order][known]
         paths = paths.waiting(waits[known])
         begins = np.ones(len(episode), dtype=bool)

@@ -5,13 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from trackmdp.cluster import ADDRESS
-from trackmdp.config.options import (
-    NodeConfig,
-    count_option,
-    listed,
-    option,
-    refuse,
-)
+from trackmdp.config.options import NodeConfig, count_option, listed, option, refuse
 
 
 class PartitionConfig(NodeConfig):

@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy import sparse
 
-from trackmdp.solvers.linear import IndexArray
+from trackmdp.solvers.linear import IndexArray, summed_over
 from trackmdp.solvers.merging import Beliefs, Clocks, Rule
 from trackmdp.world.group import Group
 from trackmdp.world.model import Array
@@ -69,11 +69,7 @@ def joint_chain(rule: Rule, most: int = MOST_STATES) -> Array | None:
         system = sparse.eye_array(chain.states, format="csc") - chain.moves
         found = sparse.linalg.spsolve(sparse.csc_array(system), chain.totals)
     else:
-        found = np.zeros_like(chain.totals)
-        for _ in range(group.task.max_steps):
-            before, found = found, chain.totals + chain.moves @ found
-            if np.array_equal(before, found):
-                break
+        found = summed_over(chain.moves, chain.totals, group.task.max_steps)
     return np.asarray(found[: chain.starts].mean(axis=0, keepdims=True))
 
 

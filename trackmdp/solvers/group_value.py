@@ -16,7 +16,7 @@ from trackmdp.errors import UserError
 from trackmdp.seeding import derive
 from trackmdp.solvers.group_chain import joint_chain
 from trackmdp.solvers.group_figures import GroupEvaluation
-from trackmdp.solvers.linear import IndexArray, accumulate, grid_of
+from trackmdp.solvers.linear import IndexArray, accumulate, grid_of, summed_over
 from trackmdp.solvers.merging import Beliefs, Clocks, Reports, Rule, followed, switched_on
 from trackmdp.world.model import Array, BoolArray
 from trackmdp.world.together import Together
@@ -106,11 +106,7 @@ def known_mean(rule: Rule) -> float:
         if world.max_steps is None:
             total = accumulate(world.kernel, reward, grid_of(world))
         else:
-            total = np.zeros(world.num_cells)
-            for _ in range(world.max_steps):
-                before, total = total, reward + world.kernel @ total
-                if np.abs(total - before).max() <= 1e-14 * np.abs(total).max():
-                    break
+            total = summed_over(world.kernel, reward, world.max_steps)
         means.append(float(total.mean()))
     return sum(means[kind] for kind in rule.group.kind)
 

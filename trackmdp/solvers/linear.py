@@ -318,6 +318,19 @@ def still_to_come(world: World, change: float, largest: float, left: int) -> flo
         return change * left
 
 
+def summed_over(moves: sparse.csr_array, gathered: Array, steps: int) -> Array:
+    """`[B]` or `[B, K]`, the sum of (moves)^t gathered over t = 0 ... steps - 1: the total of so many steps.
+
+    Rounds that add no more than rounding are left out; see `still_to_come`.
+    """
+    found = np.zeros_like(gathered)
+    for _ in range(steps):
+        before, found = found, gathered + moves @ found
+        if np.abs(found - before).max() <= _LAST_BITS * np.abs(found).max():
+            break
+    return found
+
+
 def triangular(
     transition: sparse.csr_array, gathered: Array, order: IndexArray, *, transposed: bool = False
 ) -> Array:

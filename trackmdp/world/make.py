@@ -205,9 +205,9 @@ def load_tracks(
     if isinstance(named := track_options.get("columns"), Mapping):
         track_options["columns"] = [f"{ours}:{theirs}" for ours, theirs in named.items()]
     words = {"kernel": "tracks", "kernel.path": source} | _words(locals(), track_options)
-    # Of the commands `train` takes most: recordings, several targets, and for a2c a budget as well.
-    of_several = {} if targets == 1 else {"targets.count": targets, "algo": "a2c"}
-    cfg = compose("train" if of_several else "compare", words | of_several)
+    # `compare` has no option of several targets; `evaluate` takes them, and with a budget too where no sensor is on.
+    of_several = {} if targets == 1 else {"targets.count": targets, "baseline": "none"}
+    cfg = compose("evaluate" if of_several else "compare", words | of_several)
     made = cast(Recorded, make_problem(cfg, frame=path if in_memory else None))
     return made if targets == 1 else Group.of_tracks(made, targets)
 

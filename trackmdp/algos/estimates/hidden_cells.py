@@ -13,14 +13,18 @@ from typing import TypeAlias
 
 import numpy as np
 
-from trackmdp.algos.estimates.second_order import displacements, heading_after, headings, shift
+from trackmdp.algos.estimates.second_order import (
+    WEIGHT,
+    displacements,
+    heading_after,
+    headings,
+    shift,
+)
 from trackmdp.solvers.linear import IndexArray
 from trackmdp.world.model import Array, BoolArray, Task
 from trackmdp.world.tracks import Tracks
 
 _SWEEPS = 20
-_WEIGHT = 3.0
-"""Moves as many as which the motion of the cell counts in the motion after a cell and a move."""
 _MOST_MOVES = 50
 """Displacements up to which cells are drawn so: where targets leap far, the last move tells little."""
 _LEAP = 1e-6
@@ -130,7 +134,7 @@ class _Moves:
         codes = _codes(self.task, self.moves, cell, mode, after)
         count = {name: _looked_up(*self.counts[name], each) for name, each in codes.items()}
         alone = count["bc"] / np.maximum(count["b"], 1.0)
-        found: Array = (count["bmc"] + _WEIGHT * alone) / (count["bm"] + _WEIGHT)
+        found: Array = (count["bmc"] + WEIGHT * alone) / (count["bm"] + WEIGHT)
         return found + _LEAP
 
 

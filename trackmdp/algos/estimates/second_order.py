@@ -14,7 +14,7 @@ from trackmdp.solvers.linear import IndexArray, row_index
 from trackmdp.world.model import Task, World
 from trackmdp.world.tracks import Tracks
 
-_WEIGHT = 3.0
+WEIGHT = 3.0
 """Moves as many as which the pooled motion of the cell counts in the motion after a cell and a move."""
 
 
@@ -45,8 +45,8 @@ def second_order(task: Task, tracks: Tracks, pooled: sparse.csr_array, least: fl
     at = np.flatnonzero(middle)
     state, shape = line.cells[at] * modes + mode[at], (cells * modes, cells + 1)
     counts = sparse.csr_array((np.ones(len(at)), (state, line.cells[at + 1])), shape=shape)
-    prior = _WEIGHT * pooled[np.repeat(np.arange(cells), modes)]
-    total = np.asarray(counts.sum(axis=1)).ravel() + _WEIGHT
+    prior = WEIGHT * pooled[np.repeat(np.arange(cells), modes)]
+    total = np.asarray(counts.sum(axis=1)).ravel() + WEIGHT
     chances = sparse.csr_array(sparse.diags_array(1.0 / total) @ (counts + prior))
     row, to = row_index(chances), chances.indices
     # The pooled motion may hold moves never seen.
