@@ -14,7 +14,7 @@ from trackmdp.episodes.target_colours import COLOURS
 from trackmdp.solvers import bounds
 from trackmdp.world.group import Group
 from trackmdp.world.model import Task
-from trackmdp.world.tracks import Problem, Recorded
+from trackmdp.world.tracks import Problem
 
 MOST_STEPS = 2000
 """Steps on a page, or frames of a video; a longer episode is cut there, with a note on the page."""
@@ -47,17 +47,15 @@ def _about(problem: Problem | Group, episode: Recording, seed: str) -> str:
     """The line under the title."""
     rows, columns = problem.task.size
     about = [f"{rows} x {columns} grid, {len(episode)} steps"]
-    if isinstance(problem, Recorded):
-        about[0] += " along a held-out track"
-    if isinstance(problem, Group):
-        along = " along held-out tracks" if problem.recorded else ""
-        about[0] += f", {len(problem)} targets{along}"
+    targets = len(problem.targets)
+    about[0] += f", {targets} targets" if targets else ""
+    about[0] += " along held-out tracks" if problem.recorded else ""
     about[0] += f", seed {seed}" if seed else ""
     if len(episode) > MOST_STEPS:
         about.append(f"the first {MOST_STEPS:,} steps are shown")
     if max(rows, columns) > PAGE_WIDE:
         size = f"{min(rows, PAGE_WIDE)} x {min(columns, PAGE_WIDE)} cells"
-        about.append(f"of the grid, the {size} around the target{'s' * isinstance(problem, Group)}")
+        about.append(f"of the grid, the {size} around the target{'s' * (targets > 0)}")
     return "; ".join(about)
 
 

@@ -14,7 +14,6 @@ from trackmdp.durable import write_text
 from trackmdp.episodes.episode import Recording
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Carded
-from trackmdp.world.group import Group
 
 R = TypeVar("R", bound=Recording)
 
@@ -101,6 +100,5 @@ class Showing(Carded, Sequence[R]):
         """
         from trackmdp.episodes.video import write_video
 
-        task = self.problem.task if isinstance(self.problem, Group) else self.problem
-        write_video(Path(file), task, self._shown("video", number), speed)
+        write_video(Path(file), self.problem.single, self._shown("video", number), speed)
         return Path(file)

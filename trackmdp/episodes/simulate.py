@@ -26,10 +26,10 @@ from trackmdp.solvers.evaluate import group_rule
 from trackmdp.solvers.merging import Rule
 from trackmdp.solvers.solve import named_policy
 from trackmdp.solvers.value import check_revealed
-from trackmdp.world.group import Group
+from trackmdp.world.group import Group, check_problem
 from trackmdp.world.outcomes import Costs, Outcomes
 from trackmdp.world.paths import PathSampler, path_sampler
-from trackmdp.world.tracks import Problem, check_problem
+from trackmdp.world.tracks import Problem
 
 
 @overload
@@ -79,8 +79,7 @@ def simulate(
     Raises:
         UserError: the policy is made for another grid, or is none; `episodes` or `seed` is no such number.
     """
-    if not isinstance(problem, Group):
-        check_problem(problem, "simulate")
+    check_problem(problem, "simulate")
     if not isinstance(episodes, (int, np.integer)) or episodes < 0:
         raise UserError(f"simulate: episodes={episodes}, expected an integer >= 0")
     if isinstance(problem, Group):

@@ -13,9 +13,9 @@ from trackmdp.solvers.group_figures import GroupEvaluation
 from trackmdp.solvers.group_value import evaluate_group
 from trackmdp.solvers.merging import Rule, make_rule
 from trackmdp.solvers.solve import named_policy
-from trackmdp.world.group import Group
+from trackmdp.world.group import Group, check_problem
 from trackmdp.world.model import Array, BoolArray
-from trackmdp.world.tracks import Problem, check_problem
+from trackmdp.world.tracks import Problem
 
 if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its sets
     from trackmdp.policies.policy import PolicyLike

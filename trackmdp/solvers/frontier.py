@@ -25,8 +25,9 @@ from trackmdp.solvers.solution import Solution
 from trackmdp.solvers.solve import run_solver
 from trackmdp.solvers.tradeoff import ROUNDING, Corner, Tradeoff, height, slope, upper_hull
 from trackmdp.solvers.value import value_of
+from trackmdp.world.group import check_problem
 from trackmdp.world.model import Array, World
-from trackmdp.world.tracks import Problem, check_problem, modelled
+from trackmdp.world.tracks import Problem, modelled
 
 _LEAST = 1e-6
 """c / r beside price 0: there a sensor that brings nothing costs nothing, and may be on."""

@@ -22,9 +22,9 @@ from trackmdp.solvers.partition import blocks, narrow_halo, plan_by_blocks
 from trackmdp.solvers.regions import settled
 from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
 from trackmdp.solvers.workers import Crew, crew
-from trackmdp.world.group import Group
+from trackmdp.world.group import Group, check_problem
 from trackmdp.world.model import World
-from trackmdp.world.tracks import Problem, check_problem, modelled
+from trackmdp.world.tracks import Problem, modelled
 
 if TYPE_CHECKING:  # torch is loaded where a policy is to act
     from trackmdp.policies.policy import Policy
@@ -80,8 +80,7 @@ def solve(
         >>> solution.certified and solution.upper - solution.lower < 1e-6 * abs(solution.upper)
         True
     """
-    if not isinstance(world, Group):
-        check_problem(world, "solve")
+    check_problem(world, "solve")
     own = {f"solver.{name}": value for name, value in options.items()}
     named = given({"solver": solver, "solver.nodes": nodes, "solver.time_limit": time_limit})
     of_blocks = {"block": block, "halo": halo, "workers": workers, "sweeps": sweeps}

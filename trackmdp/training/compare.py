@@ -18,8 +18,8 @@ from trackmdp.solvers.solve import named_policy
 from trackmdp.solvers.value import replay, value_of
 from trackmdp.statistics import MeanInterval, ratio
 from trackmdp.training.evaluator import estimated_qmdp
-from trackmdp.world.group import Group, Subject
-from trackmdp.world.tracks import Problem, Recorded, check_problem
+from trackmdp.world.group import Group, Subject, check_problem
+from trackmdp.world.tracks import Problem, Recorded
 
 FIGURES = ("aihtr", "accuracy", "sensors_per_step")
 Figures: TypeAlias = dict[str, MeanInterval]
@@ -132,8 +132,7 @@ def compare(problem: Subject, policies: Mapping[str, Any] | Sequence[Any]) -> Co
         >>> compare(world, ["all_on", Policy.none(world)]).sentences
         ['Policy 2 earns 1,071.000 more per episode than all_on (exact).']
     """
-    if not isinstance(problem, Group):
-        check_problem(problem, "compare")
+    check_problem(problem, "compare")
     named = policies if isinstance(policies, Mapping) else _named(policies)
     if len(named) < 2:
         raise UserError(f"compare: {len(named)} policies, expected at least two")
@@ -142,8 +141,8 @@ def compare(problem: Subject, policies: Mapping[str, Any] | Sequence[Any]) -> Co
             problem, {name: _rule(problem, name, each) for name, each in named.items()}
         )
     tables = {name: _table(problem, name, policy) for name, policy in named.items()}
-    if isinstance(problem, Recorded):
-        return _on_tracks(problem, tables)
+    if problem.recorded is not None:
+        return _on_tracks(problem.recorded, tables)
     rows: list[Compared] = []
     for name, table in tables.items():
         found = value_of(problem, table, per_cell=False)
@@ -191,11 +190,16 @@ def _of_group(group: Group, rules: Mapping[str, Rule]) -> Comparison:
 def _rule(group: Group, name: str, policy: Any) -> Rule:
     """The policy for several targets."""
     try:
-        if policy == "qmdp" and group.recorded is not None:
-            policy = estimated_qmdp(group.recorded)
-        return group_rule(group, policy)
+        return group_rule(group, _planned(group, policy))
     except UserError as error:
         raise UserError(f"compare: {name}: {error}") from error
+
+
+def _planned(problem: Subject, policy: Any) -> Any:
+    """The policy; in place of the name of Q_MDP, which needs a motion model, that of the tracks' estimated kernel."""
+    if policy == "qmdp" and problem.recorded is not None:
+        return estimated_qmdp(problem.recorded)
+    return policy
 
 
 def _exact(value: float) -> MeanInterval:
@@ -213,8 +217,7 @@ def _named(policies: Sequence[Any]) -> dict[str, Any]:
 def _table(problem: Problem, name: str, policy: Any) -> Policy:
     """The policy as a table."""
     try:
-        if policy == "qmdp" and isinstance(problem, Recorded):
-            policy = estimated_qmdp(problem)
+        policy = _planned(problem, policy)
         named = isinstance(policy, str)
         return named_policy(problem, policy) if named else as_policy(problem.task, policy)
     except UserError as error:

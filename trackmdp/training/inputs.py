@@ -64,7 +64,7 @@ def words_of(given: Subject, folder: Path | None, subject: Subject | None = None
         subject: what is in that file, where it is not `given`.
     """
     words: dict[str, Any] = {"targets.count": len(given)} if isinstance(given, Group) else {}
-    problem = given.single if isinstance(given, Group) else given
+    problem = given.single
     for name, option in OF_TASK.items():
         value = getattr(problem, name)
         array = isinstance(value, np.ndarray)

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 from trackmdp.config import TrainConfig
 from trackmdp.world.group import Subject
-from trackmdp.world.tracks import Recorded
 
 FAR = 0.05
 """Regret per step, in rewards of a detection, from which a policy counts as poor."""
@@ -16,7 +15,7 @@ def why_chosen(config: TrainConfig, subject: Subject) -> str | None:
     """The estimate that `model_based`, the default, makes of this problem, and the reason; None of other learners."""
     if config.algo.name != "model_based":
         return None
-    recorded, task = isinstance(subject, Recorded), subject.task
+    recorded, task = subject.recorded is not None, subject.task
     estimate = getattr(config.algo, "estimate", None) or ("moves" if task.markov else "paths")
     if not task.markov:
         cause = "recorded tracks" if recorded else "hidden modes"

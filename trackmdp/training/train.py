@@ -26,9 +26,8 @@ from trackmdp.training.inputs import words_of
 from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
 from trackmdp.untrusted import reason
-from trackmdp.world.group import Group, Subject, learned_in
+from trackmdp.world.group import Group, Subject, check_problem, learned_in
 from trackmdp.world.observation import ObservationVector
-from trackmdp.world.tracks import check_problem
 
 
 def train(
@@ -70,8 +69,7 @@ def train(
         RunError: learning or writing broke down.
         Preempted: a signal ended the run; with a folder it can be resumed.
     """
-    if not isinstance(problem, Group):
-        check_problem(problem, "train")
+    check_problem(problem, "train")
     for each in callbacks:
         if not isinstance(each, Callback):
             raise UserError(f"callbacks: a {type(each).__name__}, expected a Callback")

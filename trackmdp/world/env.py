@@ -17,12 +17,12 @@ from torchrl.envs import EnvBase
 from trackmdp.errors import UserError
 from trackmdp.world.actions import checked_action
 from trackmdp.world.dynamics import FLAGS, State
-from trackmdp.world.group import Group
+from trackmdp.world.group import Group, check_problem
 from trackmdp.world.group_tracking import GroupTracking
 from trackmdp.world.model import Task
 from trackmdp.world.render import picture
 from trackmdp.world.tracking import Snapshot, Tracking
-from trackmdp.world.tracks import Problem, check_problem
+from trackmdp.world.tracks import Problem
 
 
 class TrackEnv(EnvBase):
@@ -92,14 +92,13 @@ class TrackEnv(EnvBase):
         stream: str = "world",
         device: torch.device | str = "cpu",
     ) -> None:
-        if not isinstance(world, Group):
-            check_problem(world, "TrackEnv")
+        check_problem(world, "TrackEnv")
         # A reset leaves no row done. Without the option TorchRL 0.14.1 looks whether one is after each reset, with an
         # `if` on a tensor (`_reset_check_done`), which no graph of `torch.compile` can hold.
         super().__init__(
             device=torch.device(device), batch_size=_shape(batch_size), allow_done_after_reset=True
         )
-        task: Task = world.task if isinstance(world, Group) else world
+        task: Task = world.single
         self.num_envs, self.max_steps = self.batch_size.numel(), task.max_steps
         self.num_cells, self.num_sensors = task.num_cells, task.num_sensors
         self.t_max, self._grid, self._stream = task.t_max, task.size, stream

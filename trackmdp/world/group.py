@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ from trackmdp.config.several import MOST_TARGETS
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, grid_words
 from trackmdp.world.model import Array, Task, World
-from trackmdp.world.tracks import Problem, Recorded
+from trackmdp.world.tracks import Problem, Recorded, modelled
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -162,6 +162,20 @@ Subject: TypeAlias = Problem | Group
 """What a learner learns in: one target, or several."""
 
 
+def check_problem(problem: object, caller: str) -> None:
+    """Check the first argument of a public function.
+
+    Raises:
+        UserError: it is neither a world nor recorded tracks nor a group of targets.
+    """
+    if not isinstance(problem, Subject):
+        kind = problem.__name__ if isinstance(problem, type) else type(problem).__name__
+        raise UserError(
+            f"{caller}: the first argument is a {kind}, expected a world (make_world, World) or recorded "
+            "tracks (load_tracks)"
+        )
+
+
 def one_target(subject: Subject, caller: str) -> Problem:
     """The subject, if it is of a single target.
 
@@ -185,10 +199,9 @@ def group_of(subject: Subject, count: int) -> Group:
         if len(subject) != count:
             raise UserError(f"targets.count={count}: expected {len(subject)}, as the policy has")
         return subject
-    world = subject.model
-    return (
-        Group.of_tracks(cast(Recorded, subject), count) if world is None else Group([world] * count)
-    )
+    if subject.recorded is not None:
+        return Group.of_tracks(subject.recorded, count)
+    return Group([modelled(subject, "Group")] * count)
 
 
 def learned_in(subject: Subject, count: int, *, joint: bool) -> Subject:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
-from typing import Any, Required, TypeAlias, TypedDict, Unpack
+from typing import Any, Required, Self, TypeAlias, TypedDict, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -360,6 +360,11 @@ class Task(Carded):
         return ()
 
     @property
+    def single(self) -> Self:
+        """The problem itself; of a `Group` that of its first target."""
+        return self
+
+    @property
     def given(self) -> dict[str, Any]:
         """All that a `Task` holds, as arguments of its constructor and of `World`'s."""
         return {name: getattr(self, name) for name in Task.__dataclass_fields__}
@@ -434,6 +439,10 @@ class World(Task):
     def model(self) -> World:
         """The world itself; of recorded tracks None."""
         return self
+
+    @property
+    def recorded(self) -> None:
+        """Of recorded tracks they themselves."""
 
     @property
     def selection(self) -> World:

@@ -49,7 +49,7 @@ def problem_arrays(problem: Subject, classes: Classes | None = None) -> Arrays:
         problem: the world or the recorded tracks.
         classes: `[M]` class of each cell, where a learner was given them (`algo.share_cells`).
     """
-    first = problem.single if isinstance(problem, Group) else problem
+    first = problem.single
     given = {field.name: getattr(first, field.name) for field in fields(first)}
     if isinstance(problem, Group):
         given["members"] = problem.kind

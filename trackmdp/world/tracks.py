@@ -183,6 +183,11 @@ class Recorded(Task):
         """No motion model."""
 
     @property
+    def recorded(self) -> Recorded:
+        """The tracks themselves; of a world None."""
+        return self
+
+    @property
     def motion(self) -> Motion:
         """The held-out tracks, on which policies are valued, cut off after `max_steps`."""
         return self.held_out.limited(self.max_steps).motion()
@@ -203,28 +208,15 @@ Problem: TypeAlias = World | Recorded
 """The subject of learning and evaluation: a world with its motion model, or recorded tracks."""
 
 
-def check_problem(problem: object, caller: str) -> None:
-    """Check the first argument of a public function.
-
-    Raises:
-        UserError: it is neither a world nor recorded tracks.
-    """
-    if not isinstance(problem, Problem):
-        kind = problem.__name__ if isinstance(problem, type) else type(problem).__name__
-        raise UserError(
-            f"{caller}: the first argument is a {kind}, expected a world (make_world, World) or recorded "
-            "tracks (load_tracks)"
-        )
-
-
 def modelled(problem: Problem, caller: str) -> World:
     """The problem, if it has a motion model.
 
     Raises:
-        UserError: it is recorded tracks.
+        UserError: it is recorded tracks, or several targets.
     """
     if problem.model is None:
-        raise UserError(f"{caller}: needs a motion model, expected a world, not recorded tracks")
+        kind = type(problem).__name__
+        raise UserError(f"{caller}: needs a motion model, expected a World, not a {kind}")
     return problem.model
 
 

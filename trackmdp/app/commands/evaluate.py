@@ -179,7 +179,7 @@ def _log(
     )
     log.add(episodes, {"label": subject})
     if log.close():
-        along = " along held-out tracks" if isinstance(episodes.problem, Recorded) else ""
+        along = " along held-out tracks" if episodes.problem.recorded else ""
         console.print(f"{log.episodes} episodes{along} in {log.file}")
 
 

@@ -16,7 +16,6 @@ from trackmdp.episodes.recover import recover
 from trackmdp.episodes.schema import versions_apart
 from trackmdp.errors import RunError, UserError
 from trackmdp.training.display import make_console, table
-from trackmdp.world.group import Group
 
 
 def run(cfg: ReplayConfig, folder: Path) -> None:  # noqa: ARG001  every file has a name of its own
@@ -45,9 +44,7 @@ def run(cfg: ReplayConfig, folder: Path) -> None:  # noqa: ARG001  every file ha
         if cfg.episode is None:
             _list(console, reader)
         else:
-            world = reader.world()
-            task = world.task if isinstance(world, Group) else world
-            play(console, reader.read(cfg.episode), task, cfg.speed)
+            play(console, reader.read(cfg.episode), reader.world().single, cfg.speed)
 
 
 def _exports(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> bool:

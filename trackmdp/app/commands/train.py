@@ -20,7 +20,6 @@ from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
 from trackmdp.world.gridding import said
 from trackmdp.world.group import Subject
-from trackmdp.world.tracks import Recorded
 
 
 def run(cfg: TrainConfig, folder: Path, problem: Subject | None = None) -> float:
@@ -61,11 +60,11 @@ def _run(cfg: TrainConfig, folder: Path, problem: Subject | None) -> float:
     problem = problem or problem_of(cfg, folder)
     if why := notices.why_chosen(cfg, problem):
         console.print(why)
-    if isinstance(problem, Recorded):
-        if problem.loaded:
-            console.print(f"loaded: {said(problem.loaded)}")
+    if (recorded := problem.recorded) is not None:
+        if recorded.loaded:
+            console.print(f"loaded: {said(recorded.loaded)}")
         if getattr(cfg.cost, "safe", 0.0) is None:
-            price = f"D = {problem.safe_cost:,.6g}, the sum of all prices"
+            price = f"D = {recorded.safe_cost:,.6g}, the sum of all prices"
             console.print(f"cost.safe: {price}; set the price of finding a lost target")
     trainer = make_trainer(problem, cfg, folder=folder, console=console)
     done = complete(trainer)
