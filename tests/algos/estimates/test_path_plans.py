@@ -79,9 +79,13 @@ def test_a_round_finds_the_best_plan_of_each_key(seed: int, first: bool) -> None
         assert earned(paths, found[key], points, followed) == pytest.approx(best)
 
 
-def test_equal_paths_are_followed_once_and_count_as_often_as_they_are_there() -> None:
+@pytest.mark.parametrize("safe_detection", [1.0, 0.6])
+def test_equal_paths_are_followed_once_and_count_as_often_as_they_are_there(
+    safe_detection: float,
+) -> None:
+    """The reward is undiscounted, a safe action that misses and is repeated after one move included."""
     tracks = repeated(line_walks(1), [5, 2, *[1] * 10])
-    task = recorded(tracks)
+    task = recorded(tracks, detection=0.8, safe_detection=safe_detection)
     policy = PolicyTable.from_dense(task, np.random.default_rng(0).random((9, 2, 9)) < 0.5)
     paths = Paths(task, tracks, 0.9)
     assert paths.renewal.count == Paths(task, line_walks(1), 0.9).renewal.count

@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
 from trackmdp.policies.table import SetTable
 from trackmdp.solvers.linear import IndexArray, triangular
@@ -88,15 +89,19 @@ class Paths:
         located = sum((step.located for step in steps[1:]), steps[0].located)
         earned = np.sum([step.totals[:, 0] for step in steps], axis=0)
         value = triangular(located, earned, self._order)
-        # Undiscounted: the moves before the end of step n carry γ^(n + 1).
-        factors = [self._discount ** -(n + 1) for n in range(len(steps))]
+        # Undiscounted: the moves before the end of step n carry γ^(n + 1), of a repeated safe action γ.
+        factors = [np.full(renewal.count, self._discount ** -(n + 1)) for n in range(len(steps))]
+        factors[-1][renewal.count - renewal.events.forced :] = factors[0][0]
         plain = sum(
-            (step.located * factor for step, factor in zip(steps[1:], factors[1:], strict=True)),
-            steps[0].located * factors[0],
+            (
+                sparse.diags_array(factor) @ step.located
+                for step, factor in zip(steps[1:], factors[1:], strict=True)
+            ),
+            factors[0][0] * steps[0].located,
         )
         visits = triangular(plain, self._starts, self._order, transposed=True)
         reward = sum(
-            float(visits @ (self.times * step.totals[:, 0])) * factor
+            float(visits @ (self.times * factor * step.totals[:, 0]))
             for step, factor in zip(steps, factors, strict=True)
         )
         return AlongPaths(reward, visits, self._gains(acts, value), value)
