@@ -93,10 +93,8 @@ class SensorCredit:
         drawn = torch.rand(self.gain.shape, generator=generator, device=on.device) < gather(
             on, self.entry
         )
-        moves, gains = (
-            scatter_add(moved.float(), self.entry, size),
-            scatter_add(self.gain, self.entry, size),
-        )
+        moves = scatter_add(moved.float(), self.entry, size)
+        gains = scatter_add(self.gain, self.entry, size)
         moves_on = scatter_add((moved & drawn).float(), self.entry, size).view(shape)
         gains_on = scatter_add(self.gain * drawn, self.entry, size).view(shape)
         arrivals = self.arrivals.unsqueeze(-1)
@@ -205,12 +203,10 @@ class Surrogate(PolicyGradient):
         generator: torch.Generator | None,
     ) -> None:
         super().__init__(entropy)
-        self._epsilon, self._minibatches, self._generator, self._renew = (
-            clip_epsilon,
-            minibatches,
-            generator,
-            True,
-        )
+        self._epsilon = clip_epsilon
+        self._minibatches = minibatches
+        self._generator = generator
+        self._renew = True
 
     def allocate(self, shape: tuple[int, int, int], device: torch.device) -> None:
         """Room for the old policy's logits."""

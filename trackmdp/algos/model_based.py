@@ -77,10 +77,8 @@ class ModelBased:
         self._least = least_worth_planning(task)
         self._rng = np.random.default_rng(derive(seed, "model_based"))
         self._iteration, self._spent = 0, np.zeros(2)
-        beliefs, on_paths = (
-            ("believed_aihtr", "believed_deviation"),
-            ("keys_seen", "reward_per_move"),
-        )
+        beliefs = ("believed_aihtr", "believed_deviation")
+        on_paths = ("keys_seen", "reward_per_move")
         self._found = dict.fromkeys(beliefs if by == "moves" else on_paths, math.nan)
         self._before: PolicyTable | None = None
         self.actor = Policy.all_on(task)

@@ -80,10 +80,8 @@ class OnPolicy(Checkpointed):
             "critic_coeff": cfg.critic_coef,
             "loss_critic_type": "l2",
         }
-        self.loss, self.generator = (
-            self.make_loss(self.policy, self.critic, **common),
-            generator(seed, "minibatches"),
-        )
+        self.loss = self.make_loss(self.policy, self.critic, **common)
+        self.generator = generator(seed, "minibatches")
         self.costs = Costs(task, device) if actor is None else None
 
     @property

@@ -41,12 +41,10 @@ class SegmentBuffer:
         generator: torch.Generator,
         judge: int | None = None,
     ) -> None:
-        self.num_cells, self.steps, self.judge, self._generator = (
-            task.num_cells,
-            steps,
-            judge,
-            generator,
-        )
+        self.num_cells = task.num_cells
+        self.steps = steps
+        self.judge = judge
+        self._generator = generator
         self._keys = task.keys if task.order else None
         self._outside = self._keys.num_keys if self._keys else task.num_cells
         self._paths = SensedPaths(task, capacity)

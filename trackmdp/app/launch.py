@@ -117,10 +117,8 @@ def _sweep(compose: Composer) -> int:
     command, words = compose.command, run_words(compose.words)
     cfg = _of_all_runs(compose)
     # Now, so that a missing package is reported before anything is planned or written.
-    sweeper, launcher = (
-        _plugin("sweeper", cfg.hydra.sweeper),
-        _plugin("launcher", cfg.hydra.launcher),
-    )
+    sweeper = _plugin("sweeper", cfg.hydra.sweeper)
+    launcher = _plugin("launcher", cfg.hydra.launcher)
     grids = getattr(sweeper, "blocks", [sweeper.name]) or []
     # `hydra.sweep.dir` is `${sweep_name:}`, which is resolved in the next line: the same words find the same folder
     # again, and with it the runs that are done. Hydra's own time stamp would begin anew each time.

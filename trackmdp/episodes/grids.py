@@ -54,11 +54,9 @@ def constant(cell: np.dtype[Any], side: float = 1) -> bytes:
     return json_bytes(said)[1:-1]
 
 
-_GRID_SAYS, _ACTIVE_SAYS, _TARGET_SAYS = (
-    constant(_CELL),
-    constant(ACTIVE),
-    constant(_TARGET, side=0.5),
-)
+_GRID_SAYS = constant(_CELL)
+_ACTIVE_SAYS = constant(ACTIVE)
+_TARGET_SAYS = constant(_TARGET, side=0.5)
 
 _DOT = np.array([[[1]], [[0]]], np.uint8)
 """The target's layer, a single cell; 0 once it has exited."""
@@ -210,11 +208,9 @@ def read_grid(
         ValueError, KeyError, TypeError: it is none of a grid of `size`.
     """
     (rows, columns), said = size, json.loads(text)
-    left, low, width = (
-        said["pose"]["position"]["x"],
-        said["pose"]["position"]["y"],
-        said["column_count"],
-    )
+    left = said["pose"]["position"]["x"]
+    low = said["pose"]["position"]["y"]
+    width = said["column_count"]
     cells = np.frombuffer(base64.b64decode(said["data"], validate=True), cell).reshape(-1, width)
     top, bottom = rows - low - len(cells), rows - low
     if not (0 <= top < bottom <= rows and left >= 0 and left + width <= columns):

@@ -174,10 +174,8 @@ class EpisodeLogger(Callback):
 
     def on_evaluation(self, trainer: Training, policy: Policy, score: Score) -> None:  # noqa: ARG002
         """Record episodes of this policy where they are due."""
-        iteration, every = (
-            trainer.position.iteration,
-            trainer.config.evaluation.every * self._cfg.evaluations,
-        )
+        iteration = trainer.position.iteration
+        every = trainer.config.evaluation.every * self._cfg.evaluations
         if iteration == 1 or trainer.due(every):
             facts = {"label": f"iteration {iteration}"}
             self._log.record(policy, facts, self._cfg.episodes, iteration)

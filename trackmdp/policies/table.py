@@ -42,13 +42,11 @@ class SetTable:
         probability: float | None = None,
         k: int | None = None,
     ) -> None:
-        self.task, self.sets, self.plans, self.probability, self.k = (
-            task,
-            sets,
-            plans,
-            probability,
-            k,
-        )
+        self.task = task
+        self.sets = sets
+        self.plans = plans
+        self.probability = probability
+        self.k = k
         self.deterministic = (
             probability in (0.0, 1.0) if sets is None else bool(sets.dtype == np.bool_)
         )

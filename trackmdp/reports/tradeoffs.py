@@ -66,10 +66,8 @@ def _draw(axes: Axes, found: Tradeoff, asked: Mapping[str, Mixture], name: str) 
     axes.plot(sensors, heights, color=INK, marker=marker, label="policies")
     for key, mixture in asked.items():
         marker = "D" if key == "accuracy" else "s"
-        point, label = (
-            (mixture.sensors, getattr(mixture, name)),
-            f"{key}={getattr(mixture, key):.4g}",
-        )
+        point = (mixture.sensors, getattr(mixture, name))
+        label = f"{key}={getattr(mixture, key):.4g}"
         axes.plot(*point, color=VERMILION, marker=marker, ls="", label=label)
 
 

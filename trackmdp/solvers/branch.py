@@ -78,11 +78,9 @@ class Tree:
             mass: `[B, M]`, where the undetected target may be, one problem per row; without it, B = M and row x is e_x.
             delayed: bounds on complete sets, at least as tight as `revealed`.
         """
-        self._world, self._detected, self._windowed = (
-            problem.world,
-            problem.detected,
-            problem.windowed,
-        )
+        self._world = problem.world
+        self._detected = problem.detected
+        self._windowed = problem.windowed
         self._revealed, self._slack, self._delayed = revealed, slack, delayed
         self._joint = Joint(problem.world, problem.detected, revealed)
         self.best = lower.copy()
@@ -215,10 +213,8 @@ class Tree:
     def _losses(self, choices: Choices) -> tuple[Array, Array]:
         """`[P]` joint loss of the cells left, `[P, K - k]` the addition of each undecided cell if it is left."""
         frontier, k = choices.frontier, choices.decided
-        lost, added = (
-            choices.lost.copy(),
-            np.zeros((len(choices.state), frontier.cells.shape[1] - k)),
-        )
+        lost = choices.lost.copy()
+        added = np.zeros((len(choices.state), frontier.cells.shape[1] - k))
         some = np.flatnonzero(choices.left.any(axis=1))
         if not len(some):
             return lost, added
@@ -343,10 +339,8 @@ class Tree:
         """`[P]` upper bound on the worth of the mass that complete `choices` leave undetected."""
         assert self._delayed is not None
         row, cells, _ = choices.left_cells()
-        left, before = (
-            LeftOut.of(row, cells, self._world.num_cells),
-            choices.frontier.before[choices.state],
-        )
+        left = LeftOut.of(row, cells, self._world.num_cells)
+        before = choices.frontier.before[choices.state]
         return self._delayed.worth(before, left, choices.frontier.sets_left - 1)
 
     def _open(

@@ -141,10 +141,8 @@ class _Moves:
         to, mass = self.to[part], self._mass[part, some]
         count, z = len(to), to.shape[1]
         # the moves two steps on, a pair (a, b) of successor and its successor in one index a Z + b
-        after, real = (
-            self.to[to].reshape(count, -1),
-            (self._there[part, :, None] & self._there[to]).reshape(count, -1),
-        )
+        after = self.to[to].reshape(count, -1)
+        real = (self._there[part, :, None] & self._there[to]).reshape(count, -1)
         same = (
             (after[:, :, None] == after[:, None, :]) & real[:, :, None] & real[:, None, :]
         ).astype(float)

@@ -63,15 +63,11 @@ class Joint:
         rows = np.repeat(np.arange(m), count)
         column = np.arange(kernel.nnz) - np.repeat(kernel.indptr[:-1], count)
         # Cell M stands for no cell: a move to it has probability 0, its sensor costs and gains nothing.
-        self._to, self._p = (
-            np.full((m + 1, count.max(initial=0)), m),
-            np.zeros((m + 1, count.max(initial=0))),
-        )
+        self._to = np.full((m + 1, count.max(initial=0)), m)
+        self._p = np.zeros((m + 1, count.max(initial=0)))
         self._to[rows, column], self._p[rows, column] = kernel.indices, kernel.data
-        self._inside, self._cost = (
-            np.append(world.stay_probability, 0.0),
-            np.append(world.prices, 0.0),
-        )
+        self._inside = np.append(world.stay_probability, 0.0)
+        self._cost = np.append(world.prices, 0.0)
         self._revealed = [np.append(known, 0.0) for known in revealed]
         self._detected = np.append(detected, 0.0)
 

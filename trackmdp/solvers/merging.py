@@ -218,10 +218,8 @@ class Merged(Rule):
     def _plans(self) -> tuple[Array, list[tuple[IndexArray, Array]]]:
         """`[Z]` V of all kinds; and for each n sorted numbers located · Z + state with W there."""
         states = self.group.kernel.shape[0]
-        values, worths = (
-            [],
-            [(list[IndexArray](), list[Array]()) for _ in range(self.task.num_choices)],
-        )
+        values = []
+        worths = [(list[IndexArray](), list[Array]()) for _ in range(self.task.num_choices)]
         # Plans are those of whole episodes, also where these are cut off.
         for kind, (world, table) in enumerate(zip(self.group.kinds, self.tables, strict=True)):
             renewal = Renewal(world, world.motion)

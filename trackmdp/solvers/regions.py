@@ -236,11 +236,9 @@ def proved(
     Returns:
         `[M]` no less than the gain of any plan over V, and the policy with the better plans found.
     """
-    short, found, regions = (
-        np.full(world.num_cells, slack),
-        [],
-        _regions(world, policy, value, side),
-    )
+    short = np.full(world.num_cells, slack)
+    found = []
+    regions = _regions(world, policy, value, side)
     for number, region in enumerate(regions):
         sets, excess = _closed(region, slack, partial(run, number, len(regions)))
         own = region.own

@@ -144,10 +144,8 @@ def _by_length(events: Events, found: Iterable[Passed]) -> list[tuple[sparse.csr
         count = len(events.codes)
         begun = sparse.diags_array((np.arange(count) >= count - events.forced).astype(np.float64))
         parts = [sparse.csr_array(begun @ steps[-1][0]), begun @ steps[-1][1]]
-        steps[0], steps[-1] = (
-            (steps[0][0] + parts[0], steps[0][1] + parts[1]),
-            (steps[-1][0] - parts[0], steps[-1][1] - parts[1]),
-        )
+        steps[0] = (steps[0][0] + parts[0], steps[0][1] + parts[1])
+        steps[-1] = (steps[-1][0] - parts[0], steps[-1][1] - parts[1])
     return steps
 
 

@@ -68,12 +68,10 @@ class KernelEstimate:
         self._modes = modes
         self.rows, self.columns = grid_size(size)
         self.columns *= modes
-        self.weight, self.exit_weight, self.share_cells, self._classes = (
-            weight,
-            exit_weight,
-            share_cells,
-            classes,
-        )
+        self.weight = weight
+        self.exit_weight = exit_weight
+        self.share_cells = share_cells
+        self._classes = classes
         self.num_cells = self.rows * self.columns
         self.direct = sparse.csr_array((self.num_cells, self.num_cells + 1))
         self.counts = self.direct
