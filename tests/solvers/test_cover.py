@@ -14,10 +14,10 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, lookahead, optimal, rules
 from trackmdp.solvers.cover import Shared
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.linear import row_index
 from trackmdp.solvers.sensing import sensing
 from trackmdp.solvers.solve import solve
 from trackmdp.solvers.value import replay
+from trackmdp.world.entries import row_index
 from trackmdp.world.model import Array, World
 from trackmdp.world.tracks import Tracks
 

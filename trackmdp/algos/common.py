@@ -10,7 +10,6 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import numpy.typing as npt
 import torch
-from scipy import sparse
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
@@ -132,7 +131,7 @@ def lifted(task: Task, table: PolicyTable) -> PolicyTable:
     known = task.keys.cell(keys) * task.revealed + keys % task.revealed
     rows = known[:, None] * task.num_choices + np.arange(task.num_choices)
     assert table.sets is not None
-    return PolicyTable(task, sparse.csr_array(table.sets[rows.ravel()]))
+    return PolicyTable(task, table.sets[rows.ravel()])
 
 
 def tensors(arrays: Mapping[str, Any]) -> dict[str, Tensor]:

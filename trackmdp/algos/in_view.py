@@ -19,7 +19,8 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from trackmdp.solvers.cover import Shared
-from trackmdp.solvers.linear import IndexArray, row_index
+from trackmdp.solvers.linear import IndexArray
+from trackmdp.world.entries import ranks, row_index
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
@@ -118,8 +119,7 @@ def _tables(task: Task, window: Window) -> dict[str, npt.NDArray[Any]]:
     cells = window.cells.cpu().numpy()
     rows, local = np.nonzero(cells < task.num_cells)
     covering = Shared.of(task, rows, cells[rows, local], task.num_cells, np.arange(task.num_cells))
-    # Pairs of a located cell and a sensor are in order: those of 0 0 2 begin at 0 and 2, and have the numbers 0 1 0.
-    number = np.arange(len(covering.rows)) - np.searchsorted(covering.rows, covering.rows)
+    number = ranks(covering.rows)
     width = int(number.max(initial=0)) + 1
     numbers = np.full((task.num_cells, width), task.total_sensors)
     numbers[covering.rows, number] = covering.sensors

@@ -21,6 +21,7 @@ from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.moves import known_as
 from trackmdp.solvers.linear import IndexArray
 from trackmdp.world.coverage import reported
+from trackmdp.world.entries import ones_at
 from trackmdp.world.model import Array, BoolArray, Task
 from trackmdp.world.tracks import Indices, Tracks, ends_of
 from trackmdp.world.windows import Window
@@ -64,8 +65,8 @@ def observed_paths(batch: TensorDictBase, task: Task, *, last: bool = False) -> 
     possible = task.choosable(located[there], sensor[there])
     there = there if possible is None else there[np.asarray(possible).ravel()]
     shape = (len(misses) * task.num_choices, task.total_sensors)
-    sets = sparse.csr_array((np.ones(len(there)), (row[there], sensor[there])), shape=shape)
-    report = reported(sets, sparse.csr_array(task.sees_by_cell.T.tocsr()))
+    sets = ones_at(row[there], sensor[there], shape, np.float64)
+    report = reported(sets, task.sees_by_cell.T.tocsr())
     if classes > 1:
         report = sparse.kron(report, np.ones((1, classes)), format="csr")
     parts = [part.cpu().numpy() for part in (batch[name][ended], misses, end)]
@@ -258,7 +259,7 @@ def _missed(paths: ObservedPaths) -> Missed:
     misses = paths.misses.astype(np.int64)
     path = np.repeat(np.arange(len(misses)), misses)
     miss = np.arange(len(path)) - ends_of(misses)[path]
-    sensed = sparse.csr_array(paths.sensed[path * paths.choices + miss])
+    sensed = paths.sensed[path * paths.choices + miss]
 
     def missed(number: IndexArray, cells: IndexArray) -> Array:
         row = np.broadcast_to(number[:, None], cells.shape)
@@ -284,9 +285,6 @@ def _recordings(line: Array, seen: BoolArray, first: IndexArray) -> IndexArray:
         paths.append(whole)
         runs.append(np.column_stack([run[whole], np.full(len(whole), distance)]))
     number = np.unique(np.concatenate(runs), axis=0, return_inverse=True)[1].ravel()
-    pairs = sparse.csr_array(
-        (np.ones(len(number)), (np.concatenate(paths), count + number)),
-        shape=(count + len(number), count + len(number)),
-    )
+    pairs = ones_at(np.concatenate(paths), count + number, (count + len(number),) * 2)
     names: IndexArray = connected_components(pairs, directed=False)[1][:count].astype(np.int64)
     return names

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from scipy import sparse
 from torch import Tensor
 
+from trackmdp.world.entries import row_index
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
@@ -15,8 +15,7 @@ def in_window(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
     """`[R, K]`, the sets `[R, S]` of a policy in the local numbers of the window around each row's located cell."""
     if task.numbered is None:
         return sets
-    row = np.repeat(np.arange(sets.shape[0]), np.diff(sets.indptr))
-    start = torch.as_tensor(task.keys.cell(row // task.num_choices))
+    start = torch.as_tensor(task.keys.cell(row_index(sets) // task.num_choices))
     # Local numbers are in the order of the cells they stand for, so that the columns of a row stay in order. A policy
     # of this task has no sensor outside the window, so that each has one below K.
     local = Window.of(task).find(start, torch.as_tensor(sets.indices, dtype=torch.int64)).numpy()

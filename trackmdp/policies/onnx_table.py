@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 
 import numpy as np
-from scipy import sparse
 
 from trackmdp.errors import require
 from trackmdp.untrusted import LARGE, decoded, read_bytes
+from trackmdp.world.entries import ones_at
 from trackmdp.world.model import Task
 from trackmdp.world.place import Place
 
@@ -62,8 +62,7 @@ def _task(about: dict[str, str], sensors: int) -> Task:
         cells = json.loads(about["footprints"])
         rows = np.repeat(np.arange(len(cells)), [len(each) for each in cells])
         columns = np.concatenate(cells).astype(np.int64)
-        entries = (np.ones(len(rows), dtype=bool), (rows, columns))
-        more["coverage"] = sparse.csr_array(entries, shape=(sensors, size[0] * size[1]))
+        more["coverage"] = ones_at(rows, columns, (sensors, size[0] * size[1]))
     if "place" in about:
         more["place"] = Place(**json.loads(about["place"]))
     return Task(size, cost=np.zeros(sensors), t_max=int(about["t_max"]), **more)  # type: ignore[arg-type]

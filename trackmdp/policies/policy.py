@@ -40,6 +40,7 @@ from trackmdp.policies.saved import load_policy, save_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.policies.tracker import Tracker
 from trackmdp.policies.unroll import draws, mixture, unrolled
+from trackmdp.world.entries import with_data
 from trackmdp.world.model import Array, Task
 from trackmdp.world.windows import Window
 
@@ -113,9 +114,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
         count = np.diff(near.indptr)
         # Each sensor's own probability of being among the k of its window.
         share = np.repeat(np.minimum(k / count, 1.0), count)
-        return cls(
-            task, sparse.csr_array((share, near.indices, near.indptr), shape=near.shape), k=k
-        )
+        return cls(task, with_data(near, share), k=k)
 
     @classmethod
     def from_function(

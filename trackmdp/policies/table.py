@@ -16,6 +16,7 @@ from scipy import sparse
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, decimal, grid_words
 from trackmdp.world.coverage import reported, shared_out
+from trackmdp.world.entries import ones_at, row_index
 from trackmdp.world.kernel_checks import short_indices
 from trackmdp.world.model import Array, BoolArray, Task, window_cells
 
@@ -104,7 +105,7 @@ class SetTable:
         coverage = self.task.coverage
         if coverage is None:
             return self.sets
-        found = reported(self.sets, sparse.csr_array(self._covers.T.tocsr()))
+        found = reported(self.sets, self._covers.T.tocsr())
         return found.astype(np.bool_) if self.deterministic else found
 
     @cached_property
@@ -112,7 +113,7 @@ class SetTable:
         """`[plans * (t_max + 1), M]`, probability of a report of a target in each cell; bool where all are certain."""
         task = self.task
         if task.coverage is not None and not task.perfect:
-            return reported(self.sets, sparse.csr_array(task.sees_by_cell.T.tocsr()))
+            return reported(self.sets, task.sees_by_cell.T.tocsr())
         if task.perfect:
             return self.seen
         assert self.sets is not None
@@ -238,8 +239,7 @@ class PolicyTable(Carded, SetTable):
         # rows of several n interleave, so that the table is sorted once all are there
         rows = np.concatenate([keys * task.num_choices + n for n, (keys, _) in enumerate(parts)])
         sensors = np.concatenate([on for _, on in parts])
-        shape = (task.num_keys * task.num_choices, task.total_sensors)
-        table = sparse.csr_array((np.ones(len(rows), dtype=bool), (rows, sensors)), shape=shape)
+        table = ones_at(rows, sensors, (task.num_keys * task.num_choices, task.total_sensors))
         table.sort_indices()
         return cls(task, short_indices(table))
 
@@ -355,7 +355,7 @@ def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
         sets = sets.astype(np.bool_ if np.isin(sets.data, (0, 1)).all() else np.float64)
     sets.sum_duplicates()  # sorts the columns of each row as well
     sets.eliminate_zeros()
-    keys = np.repeat(np.arange(sets.shape[0]), np.diff(sets.indptr)) // task.num_choices
+    keys = row_index(sets) // task.num_choices
     start = task.keys.cell(keys)
     possible = task.choosable(start, sets.indices)
     if possible is not None and not possible.all():

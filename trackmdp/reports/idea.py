@@ -55,7 +55,7 @@ def scenes(drawn: Mapped) -> list[Scene]:
     # Row x: the mass that the first set left unsensed after a detection in x, and the same after one more move.
     missed = kernel - kernel.multiply(first)
     after = missed @ kernel
-    again = np.asarray(after.multiply(second).sum(axis=1)).ravel()
+    again = after.multiply(second).sum(axis=1)
     x = int(again.argmax())
     if not again[x] > 1e-9:
         return []

@@ -22,10 +22,10 @@ from trackmdp.solvers.linear import (
     expected_steps,
     grid_of,
     per_row,
-    row_index,
     still_to_come,
 )
 from trackmdp.solvers.sensing import sensing
+from trackmdp.world.entries import row_index, with_data
 from trackmdp.world.model import Array, BoolArray, World
 
 
@@ -293,7 +293,7 @@ def _value(world: World, choices: _Choices, guess: Array | None = None) -> tuple
     earned, reach = [safe_gain(world)], [moves]
     if not world.safe:
         lost = sparse.csr_array(moves.multiply(1.0 - world.safe_detection[world.motion.cell]))
-        reach = [sparse.csr_array(sparse.hstack([moves - lost, lost]))]
+        reach = [sparse.hstack([moves - lost, lost])]
     gain = _earned(world)
     for n in reversed(range(world.num_choices)):
         report = choices.report[:, n]
@@ -306,7 +306,7 @@ def _value(world: World, choices: _Choices, guess: Array | None = None) -> tuple
     unknown = slice(1) if world.safe else slice(None, None, world.num_choices)
     size = grid_of(world)
     # Stacked only where there are two: a copy of the one would be a tenth of the memory at a million cells.
-    whole = reach[0] if world.safe else sparse.csr_array(sparse.vstack(reach[unknown]))
+    whole = reach[0] if world.safe else sparse.vstack(reach[unknown])
     system = RenewalSystem(whole, size)
     start = None if guess is None else guess.T[unknown].ravel()
     located = system.solve(np.concatenate(earned[unknown]), start)
@@ -315,9 +315,7 @@ def _value(world: World, choices: _Choices, guess: Array | None = None) -> tuple
 
 
 def _masked(moves: sparse.csr_array, keep: npt.NDArray[Any]) -> sparse.csr_array:
-    kept = sparse.csr_array(
-        (moves.data * keep, moves.indices, moves.indptr), shape=moves.shape, copy=True
-    )
+    kept = with_data(moves, moves.data * keep).copy()
     kept.eliminate_zeros()
     return kept
 

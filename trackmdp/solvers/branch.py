@@ -37,7 +37,8 @@ from trackmdp.solvers.choices import Choices, Frontier, LeftOut, Origin, sets_le
 from trackmdp.solvers.delayed import Delayed
 from trackmdp.solvers.inner import InnerProblem
 from trackmdp.solvers.joint import Joint
-from trackmdp.solvers.linear import IndexArray, per_row, row_index
+from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.world.entries import row_index, with_data
 from trackmdp.world.model import Array, BoolArray
 
 # Choices under one heap entry: enough of them for array arithmetic to pay, and not so many that poor ones are expanded
@@ -289,7 +290,7 @@ class Tree:
             (mass, cells, pointer), shape=(len(left), self._world.num_cells)
         )
         missed = choices.frontier.missed
-        return unsensed if missed is None else sparse.csr_array(unsensed + missed[choices.state])
+        return unsensed if missed is None else unsensed + missed[choices.state]
 
     def _one_more_set(
         self, mass: sparse.csr_array, sets_left: int
@@ -320,9 +321,7 @@ class Tree:
         if not any(len(each.state) for each in batches):
             return
         sets_left = batches[0].frontier.sets_left - 1
-        mass = sparse.csr_array(
-            sparse.vstack([self._left_mass(each, each.left) for each in batches], format="csr")
-        )
+        mass = sparse.vstack([self._left_mass(each, each.left) for each in batches], format="csr")
         earned = (
             np.concatenate([each.relaxed for each in batches]) - mass @ self._revealed[sets_left]
         )
@@ -367,13 +366,10 @@ class Tree:
         kept = np.flatnonzero(self._hopeful(start, np.minimum(relaxed, most)))
         if not len(kept):
             return
-        detects = self._world.detects(moved.indices)
-        found = sparse.csr_array(
-            (moved.data * detects, moved.indices, moved.indptr), shape=moved.shape
-        )
+        found = with_data(moved, moved.data * self._world.detects(moved.indices))
         frontier = Frontier.of(start, sets_left, relaxed, mass, found, leave - sense, kept, origin)
         if not self._world.perfect:
-            frontier = replace(frontier, missed=sparse.csr_array((moved - found)[kept]))
+            frontier = replace(frontier, missed=(moved - found)[kept])
         present = np.arange(frontier.cells.shape[1]) < frontier.count[:, None]
         after = self._joint.next(frontier.cells, present) if self._world.perfect else None
         frontier = replace(frontier, rest=self._least_loss(frontier), after=after)

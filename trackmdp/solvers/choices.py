@@ -8,7 +8,8 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.solvers.joint import Next
-from trackmdp.solvers.linear import IndexArray, row_index
+from trackmdp.solvers.linear import IndexArray
+from trackmdp.world.entries import among, row_index
 from trackmdp.world.model import Array, BoolArray
 
 
@@ -170,11 +171,8 @@ class LeftOut:
 
     def has(self, rows: IndexArray, cells: IndexArray) -> BoolArray:
         """Whether problem `rows` leaves `cells` out, in the shape that the two have together."""
-        # With M = 16 and the keys 37, 41 (cells 5 and 9 of problem 2), (2, 9) gives 41: found at place 1; (2, 6) gives
-        # 38: place 1 as well, another key. `minimum` is for keys beyond the last one: their place is the length.
-        wanted = rows * self.num_cells + cells
-        place = np.minimum(np.searchsorted(self.keys, wanted), max(len(self.keys) - 1, 0))
-        return self.keys[place] == wanted if len(self.keys) else np.zeros(wanted.shape, dtype=bool)
+        # With M = 16 the keys of cells 5 and 9 of problem 2 are 37 and 41.
+        return among(self.keys, rows * self.num_cells + cells)[1]
 
 
 def sets_left_out(origin: Origin | None, state: int) -> list[IndexArray]:

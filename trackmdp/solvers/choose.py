@@ -24,6 +24,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.world.entries import ranks, summing
 from trackmdp.world.model import Array, BoolArray, Task
 
 TIE = 1e-12
@@ -94,20 +95,13 @@ def priced(decisions: Decisions, task: Task, inside: Array) -> Array:
     return price
 
 
-def summing(index: IndexArray, count: int) -> sparse.csr_array:
-    """`[count, E]` 0/1 matrix that sums over the entries of each index."""
-    return sparse.csr_array(
-        (np.ones(len(index)), (index, np.arange(len(index)))), shape=(count, len(index))
-    )
-
-
 def largest(rows: IndexArray, net: Array, count: int) -> BoolArray:
     """`[G, C]`, the `count` decisions of each row with the largest `net` `[G, C]`, of equal ones the first."""
     order = np.argsort(-net, axis=0, kind="stable")
     by_row = np.argsort(rows[order], axis=0, kind="stable")
-    place = np.arange(len(rows)) - np.searchsorted(rows, rows)
     rank = np.empty(net.shape, dtype=np.int64)
-    np.put_along_axis(rank, np.take_along_axis(order, by_row, axis=0), place[:, None], axis=0)
+    ranked = np.take_along_axis(order, by_row, axis=0)
+    np.put_along_axis(rank, ranked, ranks(rows)[:, None], axis=0)
     return rank < count
 
 

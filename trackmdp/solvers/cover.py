@@ -31,6 +31,7 @@ from scipy import sparse
 from trackmdp.errors import UserError
 from trackmdp.solvers.choose import TIE, Decisions
 from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.world.entries import row_index, summing, with_data
 from trackmdp.world.model import Array, BoolArray, Task
 
 _PROVED = 1e-9
@@ -89,7 +90,7 @@ class Shared(Decisions):
                 f"coverage: {reach}, expected at most {_MOST:,}; leave out sensors, or cells that they cover"
             )
         seen = by_cell[cells]
-        entry = np.repeat(np.arange(len(cells)), np.diff(seen.indptr))
+        entry = row_index(seen)
         row, sensor = rows[entry].astype(np.int64), seen.indices
         keep = task.choosable(None if located is None else located[row], sensor)
         data = seen.data
@@ -109,13 +110,13 @@ class Shared(Decisions):
     @cached_property
     def _logs(self) -> sparse.csr_array:
         """`[E, G]` log(1 - p)."""
-        return sparse.csr_array(_with(self.sees, np.log1p(-np.minimum(self.sees.data, _CERTAIN))).T)
+        return with_data(self.sees, np.log1p(-np.minimum(self.sees.data, _CERTAIN))).T.tocsr()
 
     @cached_property
     def _odds(self) -> sparse.csr_array:
         """`[G, E]` p / (1 - p): factor of the unreported mass that a sensor adds to the reports."""
         p = np.minimum(self.sees.data, _CERTAIN)
-        return _with(self.sees, self.sees.data / (1.0 - p))
+        return with_data(self.sees, self.sees.data / (1.0 - p))
 
     def _unreported(self, on: npt.NDArray[Any]) -> Array:
         """`[E, C]` probability that no sensor of `on` `[G, C]` reports an entry."""
@@ -141,10 +142,7 @@ class Shared(Decisions):
 
     @cached_property
     def _sums(self) -> sparse.csr_array:
-        place = (self.rows, np.arange(len(self.rows)))
-        return sparse.csr_array(
-            (np.ones(len(self.rows)), place), shape=(self.count, len(self.rows))
-        )
+        return summing(self.rows, self.count)
 
     def changes(self, on: BoolArray, gain: Array, price: Array) -> Array:
         """`[G, C]` gain of switching each sensor over, all others as they are."""
@@ -226,7 +224,7 @@ class Shared(Decisions):
     def part(self, kept: IndexArray, entries: IndexArray, rows: IndexArray) -> Shared:
         """See `Decisions`."""
         place = np.searchsorted(rows, self.rows[kept])
-        sees = sparse.csr_array(self.sees[kept][:, entries])
+        sees = self.sees[kept][:, entries]
         return Shared(place, self.sensors[kept], len(rows), sees)
 
     @cached_property
@@ -287,11 +285,6 @@ class Shared(Decisions):
                 other[mine, 0], proved = _integer(self.sees[mine], gain, price[mine])
                 upper[row] = min(upper[row], proved)
         return self._better(sets, other, column, paid)[:, 0], upper
-
-
-def _with(matrix: sparse.csr_array, data: Array) -> sparse.csr_array:
-    """The same entries with other numbers."""
-    return sparse.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
 
 
 def _relaxed(sees: sparse.csr_array, gain: Array, price: Array, most: Array) -> tuple[Array, Array]:

@@ -28,7 +28,8 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.solvers.choices import LeftOut
-from trackmdp.solvers.linear import IndexArray, per_row, row_index
+from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.world.entries import padded_rows, row_index
 from trackmdp.world.model import Array, World
 
 STEPS = 6
@@ -97,12 +98,8 @@ class _Moves:
     """
 
     def __init__(self, world: World, detected: Array) -> None:
-        kernel, m = world.kernel, world.num_cells
-        count = np.diff(kernel.indptr)
-        rows, width = row_index(kernel), int(count.max(initial=0))
-        column = np.arange(kernel.nnz) - np.repeat(kernel.indptr[:-1], count)
-        self.to, p = np.zeros((m, width), dtype=np.intp), np.zeros((m, width))
-        self.to[rows, column], p[rows, column] = kernel.indices, kernel.data
+        self.to, p = padded_rows(world.kernel)
+        width = self.to.shape[1]
         self._p, self._there = p, p > 0
         # [2^Z, Z], bit b of the number of a set: with Z = 3, set 5 leaves the successors 0 and 2.
         is_left = (np.arange(2**width)[:, None] >> np.arange(width)) % 2 > 0

@@ -16,8 +16,8 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.solvers.bounds import clocked, clocked_table, valid
-from trackmdp.solvers.choose import summing
-from trackmdp.solvers.linear import expected_steps, row_index
+from trackmdp.solvers.linear import expected_steps
+from trackmdp.world.entries import row_index, summing, with_data
 from trackmdp.world.group import Group
 from trackmdp.world.model import Array, Task, World
 
@@ -85,9 +85,7 @@ class _Paired:
         """`[M, M]`, gain of sensing a cell from a known one, n = 0, before its price."""
         table = clocked_table(world).table
         worth = world.detection * (world.reward + table[:, 0] - table[:, 1])
-        kernel = world.kernel
-        data = kernel.data * worth[kernel.indices]
-        return sparse.csr_array((data, kernel.indices, kernel.indptr), shape=kernel.shape)
+        return with_data(world.kernel, world.kernel.data * worth[world.kernel.indices])
 
     @cached_property
     def value(self) -> Array:
@@ -111,7 +109,7 @@ class _Paired:
         kernel, cells = self.other.kernel, self.other.num_cells
         gone = sparse.csr_array(np.append(1.0 - self.other.stay_probability, 1.0)[:, None])
         whole = sparse.vstack([kernel, sparse.csr_array((1, cells))])
-        return sparse.csr_array(sparse.hstack([whole, gone]))
+        return sparse.hstack([whole, gone])
 
     @cached_property
     def _prices(self) -> Array:

@@ -7,9 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from trackmdp.errors import UserError
-from trackmdp.solvers.linear import IndexArray
-from trackmdp.solvers.merging import Beliefs, Clocks, Rule, switched_on
-from trackmdp.world.model import BoolArray
+from trackmdp.solvers.merging import Beliefs, Rule, followed
 
 
 class GroupTracker:
@@ -89,24 +87,9 @@ class GroupTracker:
         if not ((place >= 0) & (place < self._cells)).all():
             raise UserError(f"report({list(cells)}): expected cells from 0 to {self._cells - 1}")
         on, moved = np.array(self.sensors(), dtype=np.int64), self._beliefs.moved(self._group)
-        self._beliefs = self._left(moved, on, present & ~seen, place, seen)
-        located = np.where(seen, place + self._group.kind * self._cells, before.located[0])
-        t_max = self._policy.task.t_max
-        misses = np.where(seen, 0, np.minimum(before.misses[0] + 1, t_max + 1))
-        history = before.remembered(on, before.late(t_max))
-        self._clocks = Clocks(located[None], misses[None], present[None], history)
-
-    def _left(
-        self, moved: Beliefs, on: IndexArray, missed: BoolArray, place: np.ndarray, seen: BoolArray
-    ) -> Beliefs:
-        """Beliefs after the reports."""
-        task, cell = self._policy.task, moved.state % self._cells
-        free = switched_on(on, cell) * task.detects(cell)
-        chance = task.safe_detection[cell] if self.safe else free.astype(np.float64)
-        possible = moved.given(missed, chance, len(missed))
-        lost = np.setdiff1d(np.flatnonzero(missed), possible.row)
+        states, reports = place + self._group.kind * self._cells, (present[None], seen[None])
+        clocks, beliefs = followed(self._group, before, moved, on, states[None], reports)
+        lost = np.setdiff1d(np.flatnonzero(present & ~seen), beliefs.row)
         if len(lost) and self._group.recorded is None:  # a track may make moves that no other made
             raise UserError(f"report: target {lost[0]} is missed where it would have been detected")
-        again = np.flatnonzero(seen)
-        found = Beliefs.at(again, place[again] + self._group.kind[again] * self._cells)
-        return possible.joined(found, self._group.kernel.shape[0])
+        self._clocks, self._beliefs = clocks, beliefs

@@ -17,7 +17,8 @@ from trackmdp.seeding import derive
 from trackmdp.solvers.group_chain import joint_chain
 from trackmdp.solvers.group_figures import GroupEvaluation
 from trackmdp.solvers.linear import IndexArray, accumulate, grid_of, summed_over
-from trackmdp.solvers.merging import Beliefs, Clocks, Reports, Rule, followed, switched_on
+from trackmdp.solvers.merging import Beliefs, Clocks, Reports, Rule, followed
+from trackmdp.world.entries import among
 from trackmdp.world.model import Array, BoolArray
 from trackmdp.world.together import Together
 
@@ -162,7 +163,7 @@ class _Batch:
         self.place, present = self._moved(before)
         episode = np.broadcast_to(np.arange(shape[0])[:, None], shape)
         cell = self.place % self.cells
-        report = switched_on(on, episode * self.cells + cell) | forced[:, None]
+        report = among(on, episode * self.cells + cell)[1] | forced[:, None]
         if not (task.perfect and task.safe):
             chance = np.where(forced[:, None], task.safe_detection[cell], task.detection[cell])
             report &= self.reports.random(shape) < chance

@@ -27,6 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trackmdp.solvers.linear import IndexArray
+from trackmdp.world.entries import padded_rows
 from trackmdp.world.model import Array, BoolArray, World
 
 MOST_ENTRIES = 1 << 15
@@ -58,14 +59,10 @@ class Joint:
     """
 
     def __init__(self, world: World, detected: Array, revealed: list[Array]) -> None:
-        kernel, m = world.kernel, world.num_cells
-        count = np.diff(kernel.indptr)
-        rows = np.repeat(np.arange(m), count)
-        column = np.arange(kernel.nnz) - np.repeat(kernel.indptr[:-1], count)
         # Cell M stands for no cell: a move to it has probability 0, its sensor costs and gains nothing.
-        self._to = np.full((m + 1, count.max(initial=0)), m)
-        self._p = np.zeros((m + 1, count.max(initial=0)))
-        self._to[rows, column], self._p[rows, column] = kernel.indices, kernel.data
+        to, p = padded_rows(world.kernel, world.num_cells)
+        self._to = np.pad(to, ((0, 1), (0, 0)), constant_values=world.num_cells)
+        self._p = np.pad(p, ((0, 1), (0, 0)))
         self._inside = np.append(world.stay_probability, 0.0)
         self._cost = np.append(world.prices, 0.0)
         self._revealed = [np.append(known, 0.0) for known in revealed]

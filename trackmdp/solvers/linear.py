@@ -20,6 +20,7 @@ from scipy.linalg.lapack import dgetrf, dgetrs
 from scipy.sparse.linalg import splu, spsolve_triangular
 
 from trackmdp.errors import UserError
+from trackmdp.world.entries import summing
 from trackmdp.world.kernel_checks import short_indices
 from trackmdp.world.model import Array, World
 
@@ -80,7 +81,7 @@ class RenewalSystem:
     ) -> None:
         # I - T is an M-matrix with a dominant diagonal: its inverse is non-negative, and no pivoting is needed.
         self._system = short_indices(
-            sparse.csr_array(sparse.eye_array(transition.shape[0], format="csr") - transition)
+            sparse.eye_array(transition.shape[0], format="csr") - transition
         )
         self.exact = transition.shape[0] <= direct
         self._size, self._tolerance = size, tolerance
@@ -225,8 +226,7 @@ class _Level:
             layers = system.shape[0] // (size[0] * size[1])
             self._blocks = sparse.csr_array(sparse.block_diag([_blocks(*size)] * layers))
         else:
-            place = (np.arange(len(size)), size)
-            self._blocks = sparse.csr_array((np.ones(len(size)), place))
+            self._blocks = summing(size, size.max() + 1).T.tocsr()
         # Galerkin: with B [M, blocks] the indicator of the blocks, B^T A B is the system seen by vectors that are
         # constant on each block.
         coarse = short_indices(sparse.csr_array(self._blocks.T @ system @ self._blocks))
@@ -338,12 +338,10 @@ def triangular(
 
     `transposed`: v = gathered + transition^T v.
     """
-    sorted_ = sparse.csr_array(transition[order][:, order])
+    sorted_ = transition[order][:, order]
     system = sparse.eye_array(len(order), format="csr") - (sorted_.T if transposed else sorted_)
     found = np.empty_like(gathered)
-    found[order] = spsolve_triangular(
-        sparse.csr_array(system), gathered[order], lower=transposed, unit_diagonal=True
-    )
+    found[order] = spsolve_triangular(system, gathered[order], lower=transposed, unit_diagonal=True)
     return found
 
 
@@ -356,12 +354,6 @@ def check_length(steps: Array) -> None:
 def per_row(rows: IndexArray, values: Array, count: int) -> Array:
     """`[count]` sums of `values` over equal `rows`."""
     return np.bincount(rows, weights=values, minlength=count).astype(np.float64, copy=False)
-
-
-def row_index(matrix: sparse.csr_array) -> IndexArray:
-    """`[nnz]` the row of each stored entry."""
-    # indptr = (0, 2, 2, 5) has rows of 2, 0 and 3 entries: 0 0 2 2 2. int64, so that row · M + cell never overflows.
-    return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
 
 
 def _factorised(system: sparse.csr_array, full: int = FULL) -> Callable[[Array, bool], Array]:
@@ -397,7 +389,7 @@ def _blocks(rows: int, columns: int) -> sparse.csr_array:
     # -(-a // b) is a / b rounded up: the last blocks of a row or column may be cut off by the border.
     row, column = np.divmod(np.arange(rows * columns), columns)
     block = row // _BLOCK * -(-columns // _BLOCK) + column // _BLOCK
-    return sparse.csr_array((np.ones(len(block)), (np.arange(len(block)), block)))
+    return summing(block, block[-1] + 1).T.tocsr()
 
 
 def _ratio(part: float, whole: float) -> float:

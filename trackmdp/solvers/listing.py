@@ -23,6 +23,7 @@ from trackmdp.solvers.choose import Own
 from trackmdp.solvers.cover import Shared
 from trackmdp.solvers.linear import IndexArray
 from trackmdp.solvers.plans import Plans
+from trackmdp.world.entries import ranks
 from trackmdp.world.model import Array, BoolArray
 
 _MOST_BITS = 14
@@ -115,12 +116,11 @@ def _choices(plans: Plans) -> _Choices | None:
 def _of_sensors(plans: Plans) -> _Choices | None:
     """The sets of all steps but the last as bits, of which each sensor of a row has its own."""
     owners = [turn.choice.rows for turn in plans.turns[:-1]]
-    # Owners are in order: those of 0 0 2 begin at 0 and 2, and their sensors have the numbers 0 1 0.
-    places = [np.arange(len(owner)) - np.searchsorted(owner, owner) for owner in owners]
+    numbers = list(map(ranks, owners))
     choice = plans.turns[0].choice
     assert isinstance(choice, Own)
     few = choice.budget is not None
-    found = _small_sets(places, choice.budget or 0) if few else _all_sets(owners, places)
+    found = _small_sets(numbers, choice.budget or 0) if few else _all_sets(owners, numbers)
     if found is None:
         return None
     count, bits = found
@@ -186,7 +186,7 @@ def _subsets(width: int, most: int) -> Iterator[tuple[int, ...]]:
 def _of_patterns(plans: Plans, choice: Shared) -> _Choices | None:
     """A bit for each entry of a row at the only listed step, seen by the cheapest set that sees no others."""
     turn = plans.turns[0]
-    number = np.arange(len(turn.rows)) - np.searchsorted(turn.rows, turn.rows)
+    number = ranks(turn.rows)
     bits = int(number.max(initial=0)) + 1
     if not choice.perfect or plans.layout.count << bits > _MOST_PATTERNS:
         return None
@@ -214,7 +214,7 @@ def _cheapest(choice: Shared, price: Array, number: IndexArray, patterns: int) -
     Bit b of a pattern: the entry of a row with the `number` b is seen.
     """
     pattern = (choice.sees @ (1 << number)).astype(np.int64)
-    place = np.arange(len(pattern)) - np.searchsorted(choice.rows, choice.rows)
+    place = ranks(choice.rows)
     every, cheapest = np.arange(patterns), np.full((choice.count, patterns), np.inf)
     cheapest[:, 0] = 0.0
     for k in range(int(place.max(initial=-1)) + 1):

@@ -30,6 +30,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.choose import largest
 from trackmdp.solvers.linear import IndexArray, per_row
 from trackmdp.solvers.renewal import Renewal
+from trackmdp.world.entries import among
 from trackmdp.world.group import Group
 from trackmdp.world.model import Array, BoolArray
 
@@ -168,7 +169,7 @@ class Rule(ABC):
 
     def first_sets(self) -> list[sparse.csr_array]:
         """For each kind `[M, S]`, the set of a single target that is located."""
-        return [sparse.csr_array(_sets(table)[:: self.task.num_choices]) for table in self.tables]
+        return [_sets(table)[:: self.task.num_choices] for table in self.tables]
 
     def packed(self) -> list[dict[str, Any]]:
         """The arrays from which it is made again, of each kind."""
@@ -315,7 +316,7 @@ def followed(
     task, (present, seen) = group.task, report
     cell, episode = moved.state % task.num_cells, moved.row // present.shape[1]
     late, missed = clocks.late(task.t_max), (present & ~seen).ravel()
-    chance = switched_on(on, episode * task.num_cells + cell) * task.detects(cell)
+    chance = among(on, episode * task.num_cells + cell)[1] * task.detects(cell)
     chance = np.where(late[episode], task.safe_detection[cell], chance)
     left = moved.given(missed, np.asarray(chance, dtype=np.float64), missed.size)
     again = np.flatnonzero(seen.ravel())
@@ -324,11 +325,3 @@ def followed(
     misses = np.where(present & ~seen, np.minimum(clocks.misses + 1, task.t_max + 1), 0)
     located = np.where(seen, place, clocks.located)
     return Clocks(located, misses, present, clocks.remembered(on, late)), found
-
-
-def switched_on(sets: IndexArray, codes: IndexArray) -> BoolArray:
-    """Whether each of `codes` is among the sorted numbers `sets`."""
-    if not len(sets):
-        return np.zeros(codes.shape, dtype=bool)
-    place = np.minimum(np.searchsorted(sets, codes), len(sets) - 1)
-    return np.asarray(sets[place] == codes)

@@ -25,8 +25,9 @@ from trackmdp.config.by_blocks import PartitionConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation
-from trackmdp.solvers.linear import IndexArray, row_index
+from trackmdp.solvers.linear import IndexArray
 from trackmdp.solvers.workers import Crew, Made, in_turn
+from trackmdp.world.entries import row_index
 from trackmdp.world.model import BoolArray, World, apart
 
 Planner: TypeAlias = "Callable[[int, World], PolicyTable]"

@@ -18,8 +18,9 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from trackmdp.solvers.choose import Decisions, summing
+from trackmdp.solvers.choose import Decisions
 from trackmdp.solvers.linear import IndexArray
+from trackmdp.world.entries import summing
 from trackmdp.world.model import Array, BoolArray
 
 

@@ -13,7 +13,6 @@ from typing import Any, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
 
 from trackmdp.machine import check_free
 from trackmdp.policies.table import PolicyTable
@@ -23,6 +22,7 @@ from trackmdp.solvers.plans import Layout, Plans, Turn
 from trackmdp.solvers.sensing import sensing
 from trackmdp.solvers.value import event_system, first_events, solved, whole_renewals
 from trackmdp.solvers.walk import Events, Passed, Step, Walk, all_events, passed
+from trackmdp.world.entries import ones_at
 from trackmdp.world.memory import KeySpace
 from trackmdp.world.model import Array, BoolArray, Task, World
 from trackmdp.world.motion import Motion
@@ -247,9 +247,8 @@ def _step_bytes(motion: Motion, choices: int) -> float:
     """About the memory of the entries and moves of one event, from a sample of states."""
     states = motion.num_states
     start = np.unique(np.linspace(0, states - 1, _SAMPLED).astype(np.int64))
-    moves = sparse.csr_array(motion.moves.astype(bool))
-    place = (np.arange(len(start)), start)
-    reached = sparse.csr_array((np.ones(len(start), dtype=bool), place), shape=(len(start), states))
+    moves = motion.moves.astype(bool)
+    reached = ones_at(np.arange(len(start)), start, (len(start), states))
     fan, places, steps = np.diff(moves.indptr), 0, [0]
     for _ in range(choices + 1):
         steps.append(int(fan[reached.indices].sum()))

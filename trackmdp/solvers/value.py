@@ -33,6 +33,7 @@ from trackmdp.solvers.linear import (
     triangular,
 )
 from trackmdp.solvers.walk import Events, Passed, Walk, all_events, passed
+from trackmdp.world.entries import summing
 from trackmdp.world.model import Array, BoolArray, Task, World
 from trackmdp.world.motion import Motion
 from trackmdp.world.tracks import Problem, Recorded, Tracks
@@ -143,7 +144,7 @@ def _by_length(events: Events, found: Iterable[Passed]) -> list[tuple[sparse.csr
         # Another safe action is the first step after a miss of one, and the last step after a detection.
         count = len(events.codes)
         begun = sparse.diags_array((np.arange(count) >= count - events.forced).astype(np.float64))
-        parts = [sparse.csr_array(begun @ steps[-1][0]), begun @ steps[-1][1]]
+        parts = [begun @ steps[-1][0], begun @ steps[-1][1]]
         steps[0] = (steps[0][0] + parts[0], steps[0][1] + parts[1])
         steps[-1] = (steps[-1][0] - parts[0], steps[-1][1] - parts[1])
     return steps
@@ -313,10 +314,8 @@ def averaged_kernel(motion: Motion, num_cells: int) -> sparse.csr_array:
     start = np.bincount(motion.first, minlength=motion.num_states) / len(motion.first)
     visits = accumulate(sparse.csr_array(motion.moves.T), start)
     share = visits / per_row(motion.cell, visits, num_cells)[motion.cell]
-    shape, states = (motion.num_states, num_cells), np.arange(motion.num_states)
-    into = sparse.csr_array((np.ones(len(states)), (states, motion.cell)), shape=shape)
-    out = sparse.csr_array((share, (motion.cell, states)), shape=shape[::-1])
-    return sparse.csr_array(out @ motion.moves @ into)
+    of_cell = summing(motion.cell, num_cells)
+    return of_cell @ sparse.diags_array(share) @ motion.moves @ of_cell.T.tocsr()
 
 
 def as_table(problem: Problem, policy: PolicyLike | Array | BoolArray) -> PolicyTable:

@@ -201,7 +201,7 @@ def estimated_kernel(tracks: Tracks, size: tuple[int, int]) -> sparse.csr_array:
     estimate.add_moves(*tracks.steps(estimate.num_cells))
     estimate.fit(1)
     # `[M, M + 1]`, the last column being the exit, which a kernel `[M, M]` leaves to its rows' missing mass.
-    return sparse.csr_array(estimate.mean()[:, :-1])
+    return estimate.mean()[:, :-1]
 
 
 def while_collecting(

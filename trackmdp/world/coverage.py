@@ -26,6 +26,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.errors import UserError
+from trackmdp.world.entries import ones_at, row_index, with_data
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +82,7 @@ class Coverage:
     @cached_property
     def by_cell(self) -> sparse.csr_array:
         """`[M, S]`, the sensors that cover each cell."""
-        return sparse.csr_array(self.matrix.T.tocsr())
+        return self.matrix.T.tocsr()
 
     @cached_property
     def degree(self) -> npt.NDArray[np.int64]:
@@ -121,14 +122,10 @@ def reported(sets: sparse.csr_array, sees: sparse.csr_array) -> sparse.csr_array
     with np.errstate(divide="ignore"):
         if certain or (sees.data == 1.0).all():
             shared, own = (sees, sets) if certain else (sets, sees)
-            logs = sparse.csr_array(
-                (np.log1p(-shared.data.astype(np.float64)), shared.indices, shared.indptr),
-                shape=shared.shape,
-            )
+            logs = with_data(shared, np.log1p(-shared.data.astype(np.float64)))
             found = own.astype(np.float64) @ logs if certain else logs @ own
         else:
             found = _each_log(sets, sees)
-    found = sparse.csr_array(found)
     found.data = -np.expm1(found.data)
     found.sort_indices()
     return found
@@ -136,9 +133,8 @@ def reported(sets: sparse.csr_array, sees: sparse.csr_array) -> sparse.csr_array
 
 def _each_log(sets: sparse.csr_array, sees: sparse.csr_array) -> sparse.csr_array:
     """`[R, M]` Σ log(1 - q p) over the sensors, pair by pair."""
-    rows = np.repeat(np.arange(sets.shape[0]), np.diff(sets.indptr))
-    each = sees[sets.indices]
-    place = np.repeat(np.arange(len(rows)), np.diff(each.indptr))
+    rows, each = row_index(sets), sees[sets.indices]
+    place = row_index(each)
     logs = np.log1p(-sets.data[place] * each.data)
     return sparse.csr_array(
         (logs, (rows[place], each.indices)), shape=(sets.shape[0], sees.shape[1])
@@ -205,11 +201,8 @@ def discs(
     # [S, offsets] each: every sensor's disc, and which of its cells lie in the grid.
     row, column = positions[:, :1] + down[near], positions[:, 1:] + across[near]
     inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-    sensor = np.nonzero(inside)[0]
-    place = (sensor, (row * columns + column)[inside])
-    return sparse.csr_array(
-        (np.ones(len(sensor), dtype=bool), place), shape=(len(positions), rows * columns)
-    )
+    cell, sensor = (row * columns + column)[inside], np.nonzero(inside)[0]
+    return ones_at(sensor, cell, (len(positions), rows * columns))
 
 
 def _canonical(given: Any) -> sparse.csr_array:

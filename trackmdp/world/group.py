@@ -111,7 +111,7 @@ class Group(Carded):
     @cached_property
     def kernel(self) -> sparse.csr_array:
         """`[Z, Z]` moves of all kinds, one block after the other: state z of kind k is k · M + cell."""
-        return sparse.csr_array(sparse.block_diag([each.kernel for each in self.kinds], "csr"))
+        return sparse.block_diag([each.kernel for each in self.kinds], "csr")
 
     @cached_property
     def stay_probability(self) -> Array:

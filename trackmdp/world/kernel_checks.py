@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import breadth_first_order
 
 from trackmdp.config.sensors import LARGEST_PRICE
 from trackmdp.errors import UserError
+from trackmdp.world.entries import ones_at, row_index
 from trackmdp.world.rows import pairwise_row_sums
 
 Range: TypeAlias = tuple[Callable[[npt.NDArray[np.float64]], npt.NDArray[np.bool_]], str]
@@ -140,9 +141,9 @@ def _can_exit(kernel: sparse.csr_array, sums: npt.NDArray[np.float64]) -> npt.ND
     # Vertex M is the exit; 1e-12 is rounding in a row that sums to 1. Edges are turned round, so that one search from M
     # reaches every cell that has a way out.
     m, leaves = kernel.shape[0], np.flatnonzero(sums < 1 - 1e-12)
-    rows = np.repeat(np.arange(m), np.diff(kernel.indptr))
-    back = np.concatenate([kernel.indices, np.full(len(leaves), m)]), np.concatenate([rows, leaves])
-    graph = sparse.csr_array((np.ones(len(back[0]), dtype=np.int8), back), shape=(m + 1, m + 1))
+    before = np.concatenate([kernel.indices, np.full(len(leaves), m)])
+    after = np.concatenate([row_index(kernel), leaves])
+    graph = ones_at(before, after, (m + 1, m + 1), np.int8)
     reached = np.zeros(m + 1, dtype=bool)
     reached[breadth_first_order(graph, m, return_predecessors=False)] = True
     return reached[:m]

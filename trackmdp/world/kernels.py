@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from trackmdp.world.entries import ones_at
 from trackmdp.world.files import read_matrix
 from trackmdp.world.kernel_checks import canonical_kernel
 from trackmdp.world.model import Array, BoolArray, Size, grid_size
@@ -171,8 +172,8 @@ def _place(
     rows = sparse.csr_array((total, (row, target)), shape=(len(cells), grid[0] * grid[1]))
     if border in ("renormalize", "inside"):
         empty = np.flatnonzero(np.diff(rows.indptr) == 0)
-        stays = sparse.csr_array((np.ones(len(empty)), (empty, cells[empty])), shape=rows.shape)
-        rows = sparse.csr_array(rows + stays)
+        stays = ones_at(empty, cells[empty], rows.shape, np.float64)
+        rows = rows + stays
         # All of a row by one factor, so that the exit keeps its probability and the positions their proportions.
         rows.data *= np.repeat(totals / pairwise_row_sums(rows), np.diff(rows.indptr))
     return rows

@@ -279,14 +279,14 @@ class Task(Carded):
         assert self.coverage is not None
         assert self.window is not None
         around = window_cells(self.size, self.window)
-        return sparse.csr_array(around.astype(np.int32) @ (self.coverage.by_cell > 0)) > 0
+        return (around.astype(np.int32) @ (self.coverage.by_cell > 0)) > 0
 
     @cached_property
     def sees_by_cell(self) -> sparse.csr_array:
         """`[M, S]` CSR, probability that a sensor that is on reports a target in a cell."""
         if self.coverage is None:
             return sparse.diags_array(self.detection, format="csr")
-        return sparse.csr_array(self.coverage.matrix.multiply(self.detection).T.tocsr())
+        return self.coverage.matrix.multiply(self.detection).T.tocsr()
 
     @cached_property
     def keys(self) -> KeySpace:

@@ -8,6 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from trackmdp.world.entries import row_index
+
 _LEAF = 128  # numpy adds up to so many numbers in one leaf of its summation tree
 _LANES = 3  # log2 of the 8 interleaved partial sums of a leaf
 
@@ -20,7 +22,7 @@ def pairwise_row_sums(matrix: sparse.csr_array) -> npt.NDArray[np.float64]:
     a binary tree. Zeros change no sum, so only the entries climb that tree: `_leaves` gives each column a code, its way
     up in bits, lanes first, and two partial sums of a row meet once their codes agree.
     """
-    rows = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+    rows = row_index(matrix)
     codes = _codes(matrix.shape[1])[matrix.indices]
     order = np.lexsort((codes, rows))  # stable: within a lane in the order of the columns
     rows, codes, sums = rows[order], codes[order], matrix.data[order]

@@ -104,7 +104,7 @@ class Tracks:
         )
         seen = np.bincount(start, minlength=num_cells)
         share = sparse.diags_array(1.0 / (seen + 1.0)) @ sparse.csr_array(moved)
-        return sparse.csr_array(share[:, :num_cells])
+        return share[:, :num_cells]
 
     def motion(self, *, anywhere: bool = False) -> Motion:
         """The tracks as a chain of their P points, each followed by the next one with probability 1.

@@ -6,7 +6,8 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.errors import UserError
-from trackmdp.solvers.linear import IndexArray, per_row, row_index
+from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.world.entries import row_index, with_data
 from trackmdp.world.files import read_numbers
 from trackmdp.world.model import BoolArray
 
@@ -77,15 +78,13 @@ class AlikeCells:
         expected = self.pooled(counts)
         # Misses leave traces of moves that nobody may have made, and 1 / E of a millionth would be a million below.
         made = expected >= 1.0
-        counts, expected = (sparse.csr_array(each.multiply(made)) for each in (counts, expected))
+        counts, expected = (each.multiply(made) for each in (counts, expected))
         out, together = counts.sum(axis=1), expected.sum(axis=1)
         # E = n_x (the group's share of the move). The sum of (O - E)² / E over entries is that of O² / E less that of
         # O, and entries of the group that were not seen out of a cell take part with O = 0.
         rows = row_index(expected)
         share = (out / np.maximum(together, 1e-300))[rows]
-        expected = sparse.csr_array(
-            (expected.data * share, expected.indices, expected.indptr), shape=counts.shape
-        )
+        expected = with_data(expected, expected.data * share)
         # Misses leave shares of 1e-310 of a move, whose inverse would be infinite.
         seen = expected.data > 1e-100
         inverse = sparse.csr_array(
@@ -130,4 +129,4 @@ class AlikeCells:
         """`[M, M + 1]` with the row of the first cell of each group, moved to all the others'."""
         kept = np.zeros(len(self.groups))
         kept[self.first] = 1.0
-        return self.pooled(sparse.csr_array(sparse.diags_array(kept) @ kernel))
+        return self.pooled(sparse.diags_array(kept) @ kernel)

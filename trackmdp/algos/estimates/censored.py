@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from trackmdp.solvers.linear import IndexArray, row_index
+from trackmdp.solvers.linear import IndexArray
+from trackmdp.world.entries import row_index
 from trackmdp.world.model import Array, BoolArray
 
 _AT_ONCE = 2**14
@@ -46,7 +47,7 @@ class ObservedPaths:
     def sets(self, misses: int) -> list[sparse.csr_array]:
         """`[K, M]` the sets of the first `misses` misses."""
         # Rows t, t + (t_max + 1), ...: the set of miss t of every path.
-        return [sparse.csr_array(self.sensed[t :: self.choices]) for t in range(misses)]
+        return [self.sensed[t :: self.choices] for t in range(misses)]
 
     def pick(self, paths: IndexArray) -> ObservedPaths:
         """The `paths` of these numbers, in their order."""
@@ -79,9 +80,7 @@ class ObservedPaths:
             np.concatenate([getattr(part, name) for part in each])
             for name in ("start", "misses", "end")
         )
-        return cls(
-            start, misses, sparse.csr_array(sparse.vstack([part.sensed for part in each])), end
-        )
+        return cls(start, misses, sparse.vstack([part.sensed for part in each]), end)
 
     def state(self) -> dict[str, np.ndarray]:
         """Plain arrays of all of it."""
@@ -146,9 +145,9 @@ def expected_moves(
             made.add(forward[n], counted(each, some.end, weight, (len(part), m + 1)))
         for t in range(n - 1, -1, -1):
             later = _hidden(later, sensed[t])
-            made.add(forward[t], sparse.csr_array(sparse.diags_array(weight) @ later))
+            made.add(forward[t], sparse.diags_array(weight) @ later)
             # l_t(i) = sum_j P_ij l_{t+1}(j), with l zero where the cell was sensed: there it would have been detected.
-            later = sparse.csr_array((later @ moves.T).multiply(_support(forward[t])))
+            later = (later @ moves.T).multiply(_support(forward[t]))
     return made.matrix()
 
 
@@ -169,7 +168,7 @@ class _OnEntries:
         pairs = pairs[rows]
         pairs.resize(some.shape)
         some.data[:] = 1.0
-        found = sparse.csr_array(pairs.multiply(some))
+        found = pairs.multiply(some)
         width = some.shape[1]
         place = np.searchsorted(
             row_index(some) * width + some.indices, row_index(found) * width + found.indices
@@ -188,7 +187,7 @@ class _OnEntries:
 def _directions(kernel: sparse.csr_array) -> tuple[sparse.csr_array, sparse.csr_array, Array]:
     """Of a kernel `[M, M + 1]`: moves `[M, M]`, by their ends `[M + 1, M]` with nothing at M, and exits `[M]`."""
     m = kernel.shape[0]
-    moves = sparse.csr_array(kernel[:, :-1])
+    moves = kernel[:, :-1]
     backward = sparse.csr_array(moves.T)
     backward.resize((m + 1, m))
     return moves, backward, kernel[:, [m]].toarray().ravel()
@@ -202,12 +201,12 @@ def _ending(
     # From every cell the target may exit: row M of the transposed kernel is dense, but a path is in few cells.
     gone = sparse.diags_array((end == len(leave)).astype(np.float64))
     left = gone @ support @ sparse.diags_array(leave)
-    return sparse.csr_array(backward[end].multiply(support) + left)
+    return backward[end].multiply(support) + left
 
 
 def _support(mass: sparse.csr_array) -> sparse.csr_array:
     """1 where there is mass."""
-    return sparse.csr_array(mass > 0).astype(np.float64)
+    return (mass > 0).astype(np.float64)
 
 
 def _parts(
@@ -260,7 +259,7 @@ def hidden_cells(
             forward, after = _forward(moves, some, some.sets(n)), some.end
             for t in range(n, 0, -1):
                 later = _ending(backward, leave, forward[t], after)
-                likely = sparse.csr_array(forward[t].multiply(later))
+                likely = forward[t].multiply(later)
                 after = drawn_columns(likely, some.start, rng)
                 found[place[part] + t - 1] = after
     return found
@@ -281,7 +280,7 @@ def drawn_columns(
 
 def _hidden(mass: sparse.csr_array, sensed: sparse.csr_array) -> sparse.csr_array:
     """`mass` less the reported part of it: `sensed` holds the sensors' p_d."""
-    left = sparse.csr_array(mass - mass.multiply(sensed))
+    left = mass - mass.multiply(sensed)
     left.eliminate_zeros()
     return left
 

@@ -21,6 +21,7 @@ from trackmdp.algos.estimates.second_order import (
     shift,
 )
 from trackmdp.solvers.linear import IndexArray
+from trackmdp.world.entries import among
 from trackmdp.world.model import Array, BoolArray, Task
 from trackmdp.world.tracks import Tracks
 
@@ -148,6 +149,5 @@ def _codes(
 
 def _looked_up(codes: IndexArray, counts: Array, wanted: IndexArray) -> Array:
     """How often the `wanted` codes were counted."""
-    place = np.minimum(np.searchsorted(codes, wanted), len(codes) - 1)
-    found: Array = np.where(codes[place] == wanted, counts[place], 0)
-    return found
+    place, known = among(codes, wanted)
+    return np.where(known, counts[place], 0)

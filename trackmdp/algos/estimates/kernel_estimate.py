@@ -18,7 +18,8 @@ from scipy import sparse
 from trackmdp.algos.estimates.alike import AlikeCells
 from trackmdp.algos.estimates.censored import ObservedPaths, counted, each_once, expected_moves
 from trackmdp.algos.estimates.shrinkage import posterior_mean, unseen
-from trackmdp.solvers.linear import IndexArray, per_row, row_index
+from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.world.entries import ones_at, row_index, with_data
 from trackmdp.world.model import Array, BoolArray, apart, grid_size
 
 _OPEN = 0.01
@@ -159,7 +160,7 @@ class KernelEstimate:
         from the counts: how probabilities differ, and the share of moves not seen yet.
         """
         counts = self._pooled()
-        exits, moved = self._exits(counts), sparse.csr_array(counts[:, :-1])
+        exits, moved = self._exits(counts), counts[:, :-1]
         moved.eliminate_zeros()
         rows, out = row_index(moved), moved.sum(axis=1)
         likely, seldom = np.zeros_like(moved.data), self._seldom(moved)
@@ -170,13 +171,12 @@ class KernelEstimate:
         new, stands_for = unseen(rows, likely, out[rows], self.num_cells)
         # A little of every displacement: a cell that was never left needs some, of any size.
         typical = self._typical_moves(moved, stands_for + 1e-12 * likely)
-        typical = sparse.csr_array(typical - typical.multiply(moved > 0))
+        typical = typical - typical.multiply(moved > 0)
         total = typical.sum(axis=1)
         share = np.divide(new, total, out=np.zeros_like(new), where=(total > 0) & (new >= least))
         # The rest is for the moves seen.
         scale = (1.0 - share * total)[rows]
-        seen = sparse.csr_array((likely * scale, moved.indices, moved.indptr), shape=moved.shape)
-        moves = sparse.csr_array(seen + sparse.diags_array(share) @ typical)
+        moves = with_data(moved, likely * scale) + sparse.diags_array(share) @ typical
         moves.eliminate_zeros()
         return self._kernel(moves, exits[:, 0] / exits.sum(axis=1))
 
@@ -191,9 +191,7 @@ class KernelEstimate:
         alike = None if self.share_cells is False else self._alike()
         for _ in range(count):
             # A Dirichlet draw is a row of gamma draws, scaled to 1; 1e-300 keeps a row of tiny parameters from 0 / 0.
-            weights = sparse.csr_array(
-                (rng.standard_gamma(moves.data) + 1e-300, moves.indices, moves.indptr), moves.shape
-            )
+            weights = with_data(moves, rng.standard_gamma(moves.data) + 1e-300)
             # Where exits are rare and few were seen most draws are 0 but for rounding, and an episode may never end.
             drawn = self._kernel(
                 weights, np.maximum(rng.beta(exits[:, 0], exits[:, 1]), LEAST_EXIT)
@@ -215,12 +213,8 @@ class KernelEstimate:
         """`[M, M + 1]` from weights of the moves and `[M]` exit probabilities."""
         # The exit has a Beta of its own, and the moves share the rest: rows [stay, exit] sum to 1.
         scale = (1.0 - leave) / moves.sum(axis=1)
-        stay = sparse.csr_array(
-            (moves.data * scale[row_index(moves)], moves.indices, moves.indptr), shape=moves.shape
-        )
-        return sparse.csr_array(
-            sparse.hstack([stay, sparse.csr_array(leave[:, None])], format="csr")
-        )
+        stay = with_data(moves, moves.data * scale[row_index(moves)])
+        return sparse.hstack([stay, sparse.csr_array(leave[:, None])], format="csr")
 
     def _pooled(self) -> sparse.csr_array:
         """`[M, M + 1]` counts, of cells that move alike together."""
@@ -229,8 +223,8 @@ class KernelEstimate:
     def _parameters(self) -> tuple[sparse.csr_array, Array]:
         """Dirichlet parameters `[M, M]` of the moves and Beta parameters `[M, 2]` of the exit."""
         counts = self._pooled()
-        moved = sparse.csr_array(counts[:, :-1])
-        moves = sparse.csr_array(moved + self.weight * self._typical_moves(moved))
+        moved = counts[:, :-1]
+        moves = moved + self.weight * self._typical_moves(moved)
         moves.eliminate_zeros()
         moves.sort_indices()  # draws are made entry by entry, row by row
         return moves, self._exits(counts)
@@ -252,9 +246,7 @@ class KernelEstimate:
         # A path that got 5 columns away with 1 miss made 2 moves, so one of them went at least ceil(5 / 2) = 3.
         fastest = np.ceil(gone / (paths.misses[inside] + 1)).max(initial=1)
         near = self._near(int(max(fastest, self._farthest(self.direct[:, :-1]))) + 1)
-        return sparse.csr_array(
-            sparse.hstack([near, sparse.csr_array((self.num_cells, 1))], format="csr")
-        )
+        return sparse.hstack([near, sparse.csr_array((self.num_cells, 1))], format="csr")
 
     def _typical_moves(
         self, moved: sparse.csr_array, weight: Array | None = None
@@ -288,9 +280,9 @@ class KernelEstimate:
             near = self._near(self._farthest(moved))
             # A diagonal of ones at the rows where no displacement fits: keep @ near has the rows of `near` there, and
             # none elsewhere.
-            keep = sparse.csr_array((np.ones(len(without)), (without, without)), shape=near.shape)
+            keep = ones_at(without, without, near.shape, np.float64)
             typical, total = typical + keep @ near, np.where(total > 0, total, 1.0)
-        return sparse.csr_array(sparse.diags_array(1.0 / total) @ typical)
+        return sparse.diags_array(1.0 / total) @ typical
 
     def _seldom(self, moved: sparse.csr_array) -> BoolArray:
         """`[E]` mask of long jumps among the `[M, M]` moves seen: distances that few moves have.
@@ -317,7 +309,7 @@ class KernelEstimate:
         )
         rows, columns = (part.ravel() for part in np.meshgrid(row, column, indexing="ij"))
         near = self._put_down(rows, columns, np.ones(len(rows)))
-        return sparse.csr_array(sparse.diags_array(1.0 / near.sum(axis=1)) @ near)
+        return sparse.diags_array(1.0 / near.sum(axis=1)) @ near
 
     def _put_down(
         self, rows: IndexArray, columns: IndexArray, weight: Array, begin: IndexArray | None = None
@@ -334,11 +326,10 @@ class KernelEstimate:
             start, which = np.nonzero(inside)
             end = (row * self.columns + column)[inside]
             parts.append(counted(start, end, weight[which], (len(cells), self.num_cells)))
-        return sparse.csr_array(sparse.vstack(parts, format="csr"))
+        return sparse.vstack(parts, format="csr")
 
     def _farthest(self, moved: sparse.csr_array) -> int:
         """Rows or columns of the farthest move seen, at least 1."""
-        moved = sparse.csr_array(moved)
         return int(
             apart(self.columns, row_index(moved), moved.indices)[moved.data > 0].max(initial=1)
         )

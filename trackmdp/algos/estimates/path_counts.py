@@ -19,6 +19,7 @@ from trackmdp.algos.estimates.path_gains import AlongPaths, Paths
 from trackmdp.policies.table import PolicyTable, SetTable
 from trackmdp.solvers.linear import IndexArray, per_row
 from trackmdp.solvers.sensing import sensing
+from trackmdp.world.entries import among, ones_at, summing
 from trackmdp.world.memory import KeySpace
 from trackmdp.world.model import Array, BoolArray, Task
 
@@ -81,7 +82,7 @@ class KeyPlans:
         assert table is not None
 
         def rows(n: int, keys: IndexArray) -> sparse.csr_array:
-            return sparse.csr_array(table[keys * choices + n])
+            return table[keys * choices + n]
 
         return cls(policy.task, keys, [rows(n, keys) for n in range(choices)], rows)
 
@@ -95,14 +96,13 @@ class KeyPlans:
 
     def _rows(self, keys: IndexArray) -> list[sparse.csr_array]:
         """`[Q, S]` bool for each n."""
-        place = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
-        known = self.keys[place] == keys
+        place, known = among(self.keys, keys)
         # Rows of the known keys, then those of the others, brought into the order of `keys`.
         order = np.argsort(np.concatenate([np.flatnonzero(known), np.flatnonzero(~known)]))
         found = []
         for n, sets in enumerate(self.sets):
             both = [sets[place[known]], self.others(n, keys[~known])]
-            found.append(sparse.csr_array(sparse.vstack(both, format="csr"))[order])
+            found.append(sparse.vstack(both, format="csr")[order])
         return found
 
     def table(self) -> PolicyTable:
@@ -115,8 +115,8 @@ def interleaved(task: Task, sets: Sequence[sparse.csr_array]) -> SetTable:
     count = sets[0].shape[0]
     # Plan k after n misses is row k (t_max + 1) + n.
     order = np.arange(count * len(sets)).reshape(len(sets), count).T.ravel()
-    stacked = sparse.csr_array(sparse.vstack(sets, format="csr"))[order]
-    return SetTable(task, sparse.csr_array(stacked), count)
+    stacked = sparse.vstack(sets, format="csr")[order]
+    return SetTable(task, stacked, count)
 
 
 def plan_paths(
@@ -203,8 +203,7 @@ class _View:
         order = np.lexsort((cell, row))
         choice = sensing(task, row[order], cell[order], len(keys), located)
         on = choice.best(gain[order, None], task.prices[choice.sensors, None])[:, 0]
-        entries = (np.ones(int(on.sum()), dtype=bool), (choice.rows[on], choice.sensors[on]))
-        return sparse.csr_array(entries, shape=(len(keys), task.total_sensors))
+        return ones_at(choice.rows[on], choice.sensors[on], (len(keys), task.total_sensors))
 
 
 class _Counted:
@@ -283,7 +282,7 @@ class _Counted:
         least = float(view.paths.task.prices.min()) if view.paths.task.coverage is None else 0.0
         keys, parts = view.paths.keys, []
         # Most displacements are worth no sensor after any key at all.
-        share = sparse.csr_array(sparse.diags_array(1.0 / np.maximum(arrived + prior, 1e-12)) @ own)
+        share = sparse.diags_array(1.0 / np.maximum(arrived + prior, 1e-12)) @ own
         most = share.max(axis=0).toarray().ravel() + known.most.max(0)
         wanted = np.flatnonzero(most > least)
         for begin in range(0, len(keys), _KEYS_AT_ONCE):
@@ -292,7 +291,7 @@ class _Counted:
             value = share[each][:, wanted].toarray()
             value = value + weight[:, None] * known.after(keys[each], wanted)
             parts.append(view.sets(keys[each], np.where(value > least, value, 0.0), wanted))
-        return sparse.csr_array(sparse.vstack(parts, format="csr"))
+        return sparse.vstack(parts, format="csr")
 
     def plans(self) -> KeyPlans:
         """The sets of all keys: by their own count, or by the prior mean alone."""
@@ -317,9 +316,8 @@ class _Counted:
             on = view.sets(keys[at], np.where(value > least, value, 0.0), wanted).tocoo()
             rows.append(at[on.row])
             columns.append(on.col)
-        row, column = np.concatenate(rows), np.concatenate(columns)
         shape = (len(keys), task.total_sensors)
-        return sparse.csr_array((np.ones(len(row), dtype=bool), (row, column)), shape=shape)
+        return ones_at(np.concatenate(rows), np.concatenate(columns), shape)
 
 
 def _one_set(task: Task) -> Task:
@@ -366,8 +364,8 @@ class _Shared:
         if keys.num_classes == 1:  # a key is its cell, and has the same counts
             return cls(keys, common, row, np.ones((1, view.width)), np.ones((1, 1)))
         cells, of_key = np.unique(keys.cell(seen), return_inverse=True)
-        summing = sparse.csr_array((np.ones(len(of_key)), (of_key, np.arange(len(of_key)))))
-        gains, weight = np.maximum((summing @ own).toarray(), 0.0), summing @ arrived
+        together = summing(of_key, len(cells))
+        gains, weight = np.maximum((together @ own).toarray(), 0.0), together @ arrived
         # Poisson counts with a gamma prior on the lift (DuMouchel 1999): a rare displacement that was seen once is no
         # lift of a hundred, as it would be were chances smoothed before they are divided.
         prior = max(prior**2 / (_LIFTED * view.paths.copies), _LITTLE)

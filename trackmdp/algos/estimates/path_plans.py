@@ -18,10 +18,11 @@ from trackmdp.algos.estimates.path_gains import AlongPaths, Paths, thinned
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers.exchange import exchange
-from trackmdp.solvers.linear import IndexArray, per_row, row_index
+from trackmdp.solvers.linear import IndexArray, per_row
 from trackmdp.solvers.plans import Layout, Plans, Turn
 from trackmdp.solvers.search import candidates_of, columns_of
 from trackmdp.solvers.sensing import sensing
+from trackmdp.world.entries import ones_at, row_index
 from trackmdp.world.model import Array, Task
 from trackmdp.world.tracks import Tracks, shuffled
 
@@ -183,8 +184,7 @@ def exchanged_keys(
         rows, kept = row_index(old), stays[row_index(old)]
         row = np.concatenate([rows[kept], often[turn.choice.rows[on]]])
         sensor = np.concatenate([old.indices[kept], turn.choice.sensors[on]])
-        entries = (np.ones(len(row), dtype=bool), (row, sensor))
-        changed.append(sparse.csr_array(entries, shape=old.shape))
+        changed.append(ones_at(row, sensor, old.shape))
     return changed
 
 
@@ -215,7 +215,7 @@ def _trees(paths: Paths, followed: AlongPaths, keys: IndexArray) -> Plans:
         moves = sparse.csr_array((chance, place), shape=(len(mass), len(codes)))
         worth = task.reward + followed.value[step.following[some]]
         detected.append(per_row(now, weight[event] * worth, len(codes)) / arrived)
-        rows, inside = rows[before], np.asarray(moves.sum(axis=1)).ravel()
+        rows, inside = rows[before], moves.sum(axis=1)
         choice = sensing(task, rows, codes % task.num_cells, len(keys), located)
         turns.append(Turn(rows, moves, inside, choice, task.prices[choice.sensors]))
         left = np.zeros_like(weight)

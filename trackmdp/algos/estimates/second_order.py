@@ -10,7 +10,8 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.algos.estimates.shrinkage import without
-from trackmdp.solvers.linear import IndexArray, row_index
+from trackmdp.solvers.linear import IndexArray
+from trackmdp.world.entries import ones_at, row_index
 from trackmdp.world.model import Task, World
 from trackmdp.world.tracks import Tracks
 
@@ -44,10 +45,10 @@ def second_order(task: Task, tracks: Tracks, pooled: sparse.csr_array, least: fl
     middle[line.first[:-1]] = middle[line.first[1:] - 1] = False
     at = np.flatnonzero(middle)
     state, shape = line.cells[at] * modes + mode[at], (cells * modes, cells + 1)
-    counts = sparse.csr_array((np.ones(len(at)), (state, line.cells[at + 1])), shape=shape)
+    counts = ones_at(state, line.cells[at + 1], shape, np.float64)
     prior = WEIGHT * pooled[np.repeat(np.arange(cells), modes)]
-    total = np.asarray(counts.sum(axis=1)).ravel() + WEIGHT
-    chances = sparse.csr_array(sparse.diags_array(1.0 / total) @ (counts + prior))
+    total = counts.sum(axis=1) + WEIGHT
+    chances = sparse.diags_array(1.0 / total) @ (counts + prior)
     row, to = row_index(chances), chances.indices
     # The pooled motion may hold moves never seen.
     kept = (to < cells) & np.isin(shift(task, row // modes, to), moves)

@@ -25,7 +25,8 @@ import numpy as np
 from scipy import sparse
 from scipy.special import betaln
 
-from trackmdp.solvers.linear import IndexArray, per_row, row_index
+from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.world.entries import row_index, with_data
 from trackmdp.world.model import Array, Task, World
 
 PRECISIONS = (30.0, 300.0, 3000.0)
@@ -132,7 +133,7 @@ def least_worth_planning(task: Task) -> float:
 def believed_world(task: Task, kernel: sparse.csr_array, least: float) -> World:
     """The task with the motion of a `[M, M + 1]` kernel, the last column its exit, without moves below `least`."""
     # Plans on several moves grow with a power of the number of moves, most of which the prior may have added.
-    moves = without(sparse.csr_array(kernel[:, :-1]), least)
+    moves = without(kernel[:, :-1], least)
     if task.revealed > 1:  # of (cell, mode)
         return World.of(task, moves, modes=task.revealed, max_steps=None)
     return World.of(task, moves, max_steps=None)
@@ -145,8 +146,6 @@ def without(moves: sparse.csr_array, least: float) -> sparse.csr_array:
     after = per_row(rows, moves.data * kept, moves.shape[0])
     kept |= (after == 0)[rows]  # a row of nothing else stays as it is
     share = np.divide(before, after, out=np.ones_like(before), where=after > 0)
-    found = sparse.csr_array(
-        (moves.data * kept * share[rows], moves.indices, moves.indptr), shape=moves.shape
-    )
+    found = with_data(moves, moves.data * kept * share[rows])
     found.eliminate_zeros()
     return found
