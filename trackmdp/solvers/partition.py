@@ -27,8 +27,9 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.linear import IndexArray
 from trackmdp.solvers.workers import Crew, Made, in_turn
+from trackmdp.world.displacements import apart, cell_at
 from trackmdp.world.entries import row_index
-from trackmdp.world.model import BoolArray, World, apart
+from trackmdp.world.model import BoolArray, World
 
 Planner: TypeAlias = "Callable[[int, World], PolicyTable]"
 """From a block's number and its world to its policy, by planning or by learning."""
@@ -104,8 +105,8 @@ def within(matrix: sparse.csr_array, world: World, seen: Rectangle) -> sparse.cs
     # of rows 4 to 8 and columns 6 to 8 it is (1, 1), number 1 * 3 + 1 = 4.
     row, column = np.divmod(matrix.indices, world.columns)
     row, column = row - rows.start, column - columns.start
-    inside = (row >= 0) & (row < len(rows)) & (column >= 0) & (column < len(columns))
-    place = (row_index(matrix)[inside], (row * len(columns) + column)[inside])
+    cell, inside = cell_at((len(rows), len(columns)), row, column)
+    place = (row_index(matrix)[inside], cell[inside])
     return type(matrix)(
         (matrix.data[inside], place), shape=(matrix.shape[0], len(rows) * len(columns))
     )

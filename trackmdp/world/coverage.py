@@ -26,6 +26,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.errors import UserError
+from trackmdp.world.displacements import cell_at
 from trackmdp.world.entries import ones_at, row_index, with_data
 
 
@@ -199,10 +200,8 @@ def discs(
     down, across = (each.ravel() for each in np.meshgrid(reach, reach, indexing="ij"))
     near = down**2 + across**2 <= radius**2
     # [S, offsets] each: every sensor's disc, and which of its cells lie in the grid.
-    row, column = positions[:, :1] + down[near], positions[:, 1:] + across[near]
-    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-    cell, sensor = (row * columns + column)[inside], np.nonzero(inside)[0]
-    return ones_at(sensor, cell, (len(positions), rows * columns))
+    cell, inside = cell_at(size, positions[:, :1] + down[near], positions[:, 1:] + across[near])
+    return ones_at(np.nonzero(inside)[0], cell[inside], (len(positions), rows * columns))
 
 
 def _canonical(given: Any) -> sparse.csr_array:

@@ -19,6 +19,7 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 from trackmdp.config.world import MEMORIES
+from trackmdp.world.displacements import displacement
 
 
 class Memory:
@@ -199,8 +200,7 @@ class KeySpace:
         """Keys after a detection in `cells`, the one before having left `keys`, with `misses` in between."""
         if self.order == 0:
             return self.start(cells, modes)
-        before, columns = self.cell(keys), self.size[1]
-        rows, across = cells // columns - before // columns, cells % columns - before % columns
+        rows, across = displacement(self.size[1], self.cell(keys), cells)
         known = keys % self.num_classes // self.modes
         return self._keys(cells, self._memory.after(known, rows, across, misses), modes)
 

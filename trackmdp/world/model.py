@@ -18,6 +18,7 @@ from trackmdp.errors import UserError
 from trackmdp.machine import check_free
 from trackmdp.notebook.card import Card, Carded, Facts, grid_words, span
 from trackmdp.world.coverage import Coverage
+from trackmdp.world.displacements import apart, displacement
 from trackmdp.world.kernel_checks import (
     PRICES,
     PROBABILITIES,
@@ -474,10 +475,7 @@ class World(Task):
         """`[H, 2]` mean rows and columns of a step in each mode, over all cells alike: the look of a mode."""
         moves = self.kernel.tocoo()
         before, (cell, mode) = moves.row // self.modes, np.divmod(moves.col, self.modes)
-        steps = (
-            cell // self.columns - before // self.columns,
-            cell % self.columns - before % self.columns,
-        )
+        steps = displacement(self.columns, before, cell)
         weight = np.maximum(np.bincount(mode, moves.data, self.modes), 1e-300)
         return np.stack(
             [np.bincount(mode, moves.data * step, self.modes) / weight for step in steps], axis=1
@@ -507,12 +505,6 @@ def window_cells(size: tuple[int, int], window: int) -> sparse.csr_array:
     near = sparse.csr_array(sparse.kron(rows, columns, format="csr"), dtype=np.bool_)
     near.sort_indices()
     return near
-
-
-def apart(columns: int, start: npt.NDArray[Any], end: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """How far cells lie apart, in rows or in columns, whichever is more; arrays of any shapes that go together."""
-    (row, column), (other_row, other_column) = np.divmod(start, columns), np.divmod(end, columns)
-    return np.maximum(np.abs(row - other_row), np.abs(column - other_column))
 
 
 def grid_size(size: Size) -> tuple[int, int]:

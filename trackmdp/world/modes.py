@@ -28,6 +28,7 @@ from scipy.special import ndtr
 
 from trackmdp.config.options import GROUPS
 from trackmdp.config.registry import make
+from trackmdp.world.displacements import cell_at
 from trackmdp.world.kernel_checks import canonical_kernel, check_kernel
 from trackmdp.world.model import Array, Size, grid_size
 
@@ -63,9 +64,8 @@ def turning_back(
     # [E] changes of mode; [E, K] steps after them; and with a cell before them [M, E, K] ends.
     before, mode, cell = table.row, table.col, np.arange(rows * columns)[:, None, None]
     row, column = cell // columns + offsets[mode, :, 0], cell % columns + offsets[mode, :, 1]
-    free = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-    ahead = (row * columns + column) * modes + mode[:, None]
-    end = np.where(free, ahead, cell * modes + opposite[mode][:, None])
+    ahead, free = cell_at((rows, columns), row, column)
+    end = np.where(free, ahead * modes + mode[:, None], cell * modes + opposite[mode][:, None])
     weight = ((1.0 - exit_probability) * table.data)[:, None] * shares[mode]
     begin = cell * modes + before[:, None]
     begin, weight = (np.broadcast_to(each, end.shape).ravel() for each in (begin, weight))

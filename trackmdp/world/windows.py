@@ -16,6 +16,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from trackmdp.world.displacements import cell_at
 from trackmdp.world.model import Size, Task, grid_size
 
 
@@ -111,9 +112,8 @@ class Window(nn.Module):
         step = torch.arange(side**2, device=start.device)
         row = (self._row[start] - self.radius).unsqueeze(-1) + step // side
         column = (self._column[start] - self.radius).unsqueeze(-1) + step % side
-        # Without this test a sensor left of column 0 would wrap round to the end of the row above.
-        inside = (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
-        return torch.where(inside, row * self.columns + column, self.num_cells)
+        cell, inside = cell_at((self.rows, self.columns), row, column)
+        return torch.where(inside, cell, self.num_cells)
 
     def contains(self, start: Tensor, cell: Tensor) -> Tensor:
         """`[*B]` bool, whether `cell` `[*B]` is a cell of the window of `start` `[*B]`; never where it is M."""

@@ -12,8 +12,9 @@ from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.estimates.shrinkage import least_worth_planning, posterior_mean, unseen, without
 from trackmdp.solvers import exchange, optimal
 from trackmdp.solvers.evaluate import evaluate
+from trackmdp.world.displacements import apart
 from trackmdp.world.make import make_world
-from trackmdp.world.model import World, apart
+from trackmdp.world.model import World
 
 
 def counts_of(world: World, each: int, seed: int) -> sparse.csr_array:

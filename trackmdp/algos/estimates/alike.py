@@ -7,6 +7,7 @@ from scipy import sparse
 
 from trackmdp.errors import UserError
 from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.world.displacements import displacement
 from trackmdp.world.entries import row_index, with_data
 from trackmdp.world.files import read_numbers
 from trackmdp.world.model import BoolArray
@@ -108,11 +109,8 @@ class AlikeCells:
         # On 10 columns, 2 rows down and 1 column to the left is the shift 2 · 20 - 1 = 39, read back as row
         # (39 + 10) // 20 = 2 and column 39 - 40 = -1. The exit has a number of its own, beyond all of these.
         wide, exit_shift = 2 * self.columns, 4 * m + 1
-        shift = (
-            (end // self.columns - start // self.columns) * wide
-            + end % self.columns
-            - start % self.columns
-        )
+        down, across = displacement(self.columns, start, end)
+        shift = down * wide + across
         shifts, place = np.unique(np.where(end == m, exit_shift, shift), return_inverse=True)
         shape = (len(self.first), len(shifts))
         each = sparse.csr_array((counts.data, (self.groups[start], place)), shape=shape)[

@@ -21,6 +21,7 @@ from trackmdp.algos.estimates.second_order import (
     shift,
 )
 from trackmdp.solvers.linear import IndexArray
+from trackmdp.world.displacements import cell_at
 from trackmdp.world.entries import among
 from trackmdp.world.model import Array, BoolArray, Task
 from trackmdp.world.tracks import Tracks
@@ -107,8 +108,8 @@ class _Moves:
         columns = self.task.columns
         down, across = np.divmod(self.moves + columns, 2 * columns + 1)
         row, column = last[:, None] // columns + down, last[:, None] % columns + across - columns
-        inside = (row >= 0) & (row < self.task.rows) & (column >= 0) & (column < columns)
-        return np.where(inside, row * columns + column, 0), inside
+        cell, inside = cell_at(self.task.size, row, column)
+        return np.where(inside, cell, 0), inside
 
     def likelihood(self, line: Tracks, mode: IndexArray, at: IndexArray) -> Array:
         """`[K, H]` probability of the `candidates` at the places `at` and of the next two cells, but for a factor."""

@@ -19,8 +19,9 @@ from trackmdp.algos.estimates.alike import AlikeCells
 from trackmdp.algos.estimates.censored import ObservedPaths, counted, each_once, expected_moves
 from trackmdp.algos.estimates.shrinkage import posterior_mean, unseen
 from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.world.displacements import apart, cell_at, displacement
 from trackmdp.world.entries import ones_at, row_index, with_data
-from trackmdp.world.model import Array, BoolArray, apart, grid_size
+from trackmdp.world.model import Array, BoolArray, grid_size
 
 _OPEN = 0.01
 """Weight, in the first round's kernel, of moves that were not seen yet."""
@@ -265,8 +266,8 @@ class KernelEstimate:
         start, end, share = start[seen], end[seen], weight[seen]
         # On 10 x 10 cells, 2 rows down and 1 column to the left is the shift (2 + 10) · 20 + (-1 + 10) = 249.
         width = 2 * self.columns
-        shift = (end // self.columns - start // self.columns + self.rows) * width
-        shift = shift + end % self.columns - start % self.columns + self.columns
+        down, across = displacement(self.columns, start, end)
+        shift = (down + self.rows) * width + across + self.columns
         # With modes the shift contains the mode as well: (cell, up) moves otherwise than (cell, left).
         shifts, place = np.unique(shift * self._modes + start % self._modes, return_inverse=True)
         each = np.bincount(place, weights=share, minlength=len(shifts)).astype(np.float64)
@@ -319,13 +320,12 @@ class KernelEstimate:
         for first in range(0, self.num_cells, count):
             cells = np.arange(first, min(first + count, self.num_cells))[:, None]
             row, column = cells // self.columns + rows, cells % self.columns + columns
-            inside = (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
+            end, inside = cell_at((self.rows, self.columns), row, column)
             if begin is not None:
                 inside &= cells % self._modes == begin
             # [cells, S] in row-major order, as `end` below lists its entries.
             start, which = np.nonzero(inside)
-            end = (row * self.columns + column)[inside]
-            parts.append(counted(start, end, weight[which], (len(cells), self.num_cells)))
+            parts.append(counted(start, end[inside], weight[which], (len(cells), self.num_cells)))
         return sparse.vstack(parts, format="csr")
 
     def _farthest(self, moved: sparse.csr_array) -> int:

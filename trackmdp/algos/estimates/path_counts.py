@@ -19,6 +19,7 @@ from trackmdp.algos.estimates.path_gains import AlongPaths, Paths
 from trackmdp.policies.table import PolicyTable, SetTable
 from trackmdp.solvers.linear import IndexArray, per_row
 from trackmdp.solvers.sensing import sensing
+from trackmdp.world.displacements import apart, cell_at, displacement
 from trackmdp.world.entries import among, ones_at, summing
 from trackmdp.world.memory import KeySpace
 from trackmdp.world.model import Array, BoolArray, Task
@@ -161,37 +162,31 @@ class _View:
 
     def __init__(self, paths: Paths) -> None:
         self.paths, renewal = paths, paths.renewal
-        self._columns, self._rows = paths.task.columns, paths.task.rows
+        self._size = rows, columns = paths.task.size
         start = renewal.keys.cell(renewal.events.key)
         cells = renewal.motion.cell
         self.cell = [cells[step.states] for step in renewal.steps[:-1]]
         self.plan = [renewal.owner[step.rows] for step in renewal.steps[:-1]]
-        moved = [
-            self._moved(start[step.rows], cell)
-            for step, cell in zip(renewal.steps, self.cell, strict=False)
+        ends = [
+            (start[step.rows], cell) for step, cell in zip(renewal.steps, self.cell, strict=False)
         ]
-        far = [np.maximum(np.abs(down), np.abs(across)) for down, across in moved]
+        far = [apart(columns, *pair) for pair in ends]
         seen = np.concatenate(far)
         radius = int(np.ceil(np.quantile(seen, _IN_VIEW))) if len(seen) else 0
-        self.radius = min(max(1, radius), self._rows + self._columns, paths.task.window or 2**31)
+        self.radius = min(max(1, radius), rows + columns, paths.task.window or 2**31)
         side = 2 * self.radius + 1
         self.width = side**2
         self.local = []
-        for (down, across), away in zip(moved, far, strict=True):
+        for pair, away in zip(ends, far, strict=True):
+            down, across = displacement(columns, *pair)
             number = (down + self.radius) * side + across + self.radius
             self.local.append(np.where(away <= self.radius, number, self.width))
 
-    def _moved(self, start: IndexArray, cell: IndexArray) -> tuple[IndexArray, IndexArray]:
-        columns = self._columns
-        return cell // columns - start // columns, cell % columns - start % columns
-
     def put_down(self, start: IndexArray, local: IndexArray) -> tuple[IndexArray, BoolArray]:
         """Cells of displacements `local` from cells `start`, and whether they are in the grid."""
-        side = 2 * self.radius + 1
-        row = start // self._columns + local // side - self.radius
-        column = start % self._columns + local % side - self.radius
-        inside = (row >= 0) & (row < self._rows) & (column >= 0) & (column < self._columns)
-        return row * self._columns + column, inside
+        side, columns = 2 * self.radius + 1, self._size[1]
+        row = start // columns + local // side - self.radius
+        return cell_at(self._size, row, start % columns + local % side - self.radius)
 
     def sets(self, keys: IndexArray, gains: Array, wanted: IndexArray) -> sparse.csr_array:
         """`[Q, S]` bool, the best sets after `keys` `[Q]`, of `gains` `[Q, W]` at displacements `wanted` `[W]`."""

@@ -11,6 +11,7 @@ from scipy import sparse
 
 from trackmdp.algos.estimates.shrinkage import without
 from trackmdp.solvers.linear import IndexArray
+from trackmdp.world.displacements import displacement
 from trackmdp.world.entries import ones_at, row_index
 from trackmdp.world.model import Task, World
 from trackmdp.world.tracks import Tracks
@@ -80,6 +81,5 @@ def heading_after(
 
 def shift(task: Task, before: IndexArray, after: IndexArray) -> IndexArray:
     """One number for each pair of rows and columns moved."""
-    down = after // task.columns - before // task.columns
-    across = after % task.columns - before % task.columns
+    down, across = displacement(task.columns, before, after)
     return down * (2 * task.columns + 1) + across
