@@ -23,7 +23,7 @@ from trackmdp.config import (
     load_config,
     options,
     to_yaml,
-    world_of,
+    train_config_of,
 )
 from trackmdp.errors import UserError
 
@@ -272,4 +272,4 @@ def test_the_budget_grows_with_the_number_of_cells(choice: str, size: int, frame
 
 def test_bytes_that_are_no_text_are_no_config() -> None:
     with pytest.raises(UserError, match=r"^config.yaml: not a config \("):
-        world_of(b"\xff\xfe\xfa")
+        train_config_of(b"\xff\xfe\xfa")

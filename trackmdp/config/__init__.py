@@ -49,7 +49,6 @@ from trackmdp.config.tree import (
     to_dict,
     to_yaml,
     train_config_of,
-    world_of,
 )
 from trackmdp.config.world import MEMORIES, KernelConfig, TableConfig
 

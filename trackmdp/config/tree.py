@@ -12,7 +12,7 @@ from omegaconf import MISSING, OmegaConf
 
 from trackmdp.config.checks import absolute_paths, check_choice, own_paths, suggestion, validate
 from trackmdp.config.options import GROUPS, Node, Option, as_float, options
-from trackmdp.config.roots import CommandConfig, TrainConfig, WorldConfig
+from trackmdp.config.roots import CommandConfig, TrainConfig
 from trackmdp.errors import UserError
 from trackmdp.untrusted import parse_yaml, read_text
 
@@ -73,16 +73,6 @@ def load_config(file: Path, root: type[_C]) -> _C:
         return _checked(plain, root)
     except UserError as error:
         raise UserError(f"{file}: {error}") from error
-
-
-def world_of(text: str | bytes) -> WorldConfig:
-    """The world in the text of a `config.yaml` of any command.
-
-    Raises:
-        UserError: there is none.
-    """
-    plain, known = parse_yaml(text, "config.yaml"), options(WorldConfig)
-    return _checked({key: value for key, value in plain.items() if key in known}, WorldConfig)
 
 
 def train_config_of(text: str | bytes) -> TrainConfig:

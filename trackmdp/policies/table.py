@@ -287,6 +287,13 @@ class PolicyTable(Carded, SetTable):
             return np.full(shape, self.probability == 1.0)
         return self.sets.toarray().reshape(shape)
 
+    @cached_property
+    def written(self) -> sparse.csr_array:
+        """`[keys * (t_max + 1), S]` sets of a deterministic policy, also where one probability stands for all."""
+        if self.sets is not None:
+            return self.sets
+        return sparse.csr_array(self.dense().reshape(-1, self.task.total_sensors))
+
     def as_lists(self) -> dict[str, Any]:
         """Plain lists, as `sets.json` has them: rows and columns, t_max, and each key's sensors on at n = 0 ... t_max.
 

@@ -162,12 +162,7 @@ def read_map(place: Path, run: FinishedRun, world: str, method: str) -> Mapped |
 
 def sensed_cells(table: PolicyTable) -> sparse.csr_array:
     """`[keys (t_max + 1), M]` bool: cells in view of the sensors that a deterministic policy switches on."""
-    task = table.task
-    shape = (task.num_keys * task.num_choices, task.total_sensors)
-    # A probability of 1 or 0 stands for all sensors on or none.
-    whole = table.dense().reshape(shape) if table.probability else shape
-    sets = sparse.csr_array(whole, dtype=bool) if table.sets is None else table.sets
-    return PolicyTable(task, sets).seen
+    return PolicyTable(table.task, table.written).seen
 
 
 def averaged_sets(table: PolicyTable, sets: sparse.csr_array, visits: Array) -> sparse.csr_array:

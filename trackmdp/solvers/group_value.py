@@ -20,7 +20,6 @@ from trackmdp.solvers.linear import IndexArray, accumulate, grid_of, summed_over
 from trackmdp.solvers.merging import Beliefs, Clocks, Reports, Rule, followed
 from trackmdp.world.entries import among
 from trackmdp.world.model import Array, BoolArray
-from trackmdp.world.together import Together
 
 _FIRST = 64
 """Episodes of the first batch, from which the number needed for the wanted width is worked out."""
@@ -213,11 +212,12 @@ class _Along(_Batch):
     """All groups of held-out tracks, of which each is an episode."""
 
     def __init__(self, rule: Rule) -> None:
-        recorded = rule.group.recorded
-        assert recorded is not None
-        self.motion = recorded.held_out.motion()
-        together = Together(recorded.held_out, len(rule.group))
-        self.at = together.places(together.groups)
+        # torch is loaded where targets are moved along tracks
+        from trackmdp.world.group_paths import AlongTracks
+
+        assert rule.group.recorded is not None
+        self.paths = AlongTracks(rule.group.recorded, len(rule.group), held_out=True)
+        self.at = self.paths.every()
         super().__init__(rule, len(self.at), 0)
 
     def _start(self) -> Clocks:
@@ -225,23 +225,15 @@ class _Along(_Batch):
 
     def _cells(self) -> tuple[IndexArray, BoolArray]:
         """`[E, K]`, cells of the targets, and whether they are in the grid."""
-        inside = (self.at >= 0) & (self.at < self.motion.num_states)
-        return np.where(inside, self.motion.cell[np.where(inside, self.at, 0)], 0), inside
+        return self.paths.cell(self.at).numpy(), self.paths.inside(self.at).numpy()
 
     def _moved(self, before: BoolArray) -> tuple[IndexArray, BoolArray]:
-        # The moves are certain; a target that waits comes one track nearer.
-        points = self.motion.num_states
-        on = self.motion.stay[np.clip(self.at, 0, points - 1)] > 0
-        after = np.where(on & (self.at < points), self.at + 1, points)
-        self.at = np.where(self.at < 0, self.at + points, after)
+        self.at = self.paths.move(self.at, 0 * self.at)  # which is certain
         cell, inside = self._cells()
         self.entered = inside & ~before
         return cell, inside & before
 
     def _followed(self, present: BoolArray, seen: BoolArray) -> Reports:
-        assert self.motion.ends is not None
-        stops = np.append(self.motion.ends, False)[np.maximum(self.at, 0)]
-        inside = present | self.entered
         # Where all recordings stop that are left, the episode is over.
-        inside &= np.any(inside & ~stops, axis=1, keepdims=True)
+        inside = (present | self.entered) & ~self.paths.ended(self.at).numpy()[:, None]
         return inside, (seen | self.entered) & inside

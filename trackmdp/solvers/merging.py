@@ -146,7 +146,7 @@ class Rule(ABC):
     """Whether it reads the sets of the last steps, in place of beliefs."""
 
     def __init__(self, group: Group, tables: Sequence[PolicyTable]) -> None:
-        self.group, self.tables = group, tuple(map(_with_sets, tables))
+        self.group, self.tables = group, tuple(tables)
         self.task = group.task
         self.cells = self.task.num_cells
         for table in tables:
@@ -169,7 +169,7 @@ class Rule(ABC):
 
     def first_sets(self) -> list[sparse.csr_array]:
         """For each kind `[M, S]`, the set of a single target that is located."""
-        return [_sets(table)[:: self.task.num_choices] for table in self.tables]
+        return [table.written[:: self.task.num_choices] for table in self.tables]
 
     def packed(self) -> list[dict[str, Any]]:
         """The arrays from which it is made again, of each kind."""
@@ -205,7 +205,7 @@ class Union(Rule):
             episode, target = np.nonzero(free & (self.group.kind == kind))
             cell = seen.located[episode, target] - kind * self.cells
             row = cell * self.task.num_choices + seen.misses[episode, target]
-            on = _sets(table)[row].tocoo()
+            on = table.written[row].tocoo()
             found.append(episode[on.row] * self.cells + on.col)
         return np.unique(np.concatenate(found))
 
@@ -270,19 +270,6 @@ class Merged(Rule):
             )
             on &= kept[:, 0]
         return codes[on]
-
-
-def _with_sets(table: PolicyTable) -> PolicyTable:
-    """The same policy with its sets written out."""
-    if table.sets is not None or not table.deterministic:
-        return table
-    return PolicyTable.from_dense(table.task, table.dense())
-
-
-def _sets(table: PolicyTable) -> sparse.csr_array:
-    """The sets of a table that has them written out."""
-    assert table.sets is not None
-    return table.sets
 
 
 def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str | None = None) -> Rule:

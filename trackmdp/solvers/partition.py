@@ -169,13 +169,7 @@ class _PlanJob:
         table.check_fits(world)
         if not table.deterministic:
             raise UserError("partition.block: expected a policy that does not draw")
-        # A single probability of 0 or 1 for all sensors gives no sets beyond the halo.
-        sets = (
-            table.sets
-            if table.sets is not None
-            else PolicyTable.from_dense(world, table.dense()).sets
-        )
-        assert sets is not None
+        sets = table.written
         # Row 7 of a table with two choices is cell 3 after one miss.
         cell, n = np.divmod(row_index(sets), world.num_choices)
         numbers, kept = cells_of(block.seen, self.columns), block.mine[cell]

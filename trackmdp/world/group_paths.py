@@ -77,6 +77,10 @@ class AlongTracks(GroupPaths):
         number = int(torch.randint(len(groups), (1,), generator=rng))
         return torch.as_tensor(self.together.places(groups[number : number + 1])[0])
 
+    def every(self) -> Tensor:
+        """`[G, K]`, places at the start of all of `Together.groups`."""
+        return torch.as_tensor(self.together.places(self.together.groups))
+
     def move(self, place: Tensor, draws: Tensor) -> Tensor:
         """See `GroupPaths`."""
         after = super().move(place.clamp_min(0), draws)

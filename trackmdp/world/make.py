@@ -118,12 +118,15 @@ def make_world(
         >>> make_world("heading", size=4, reveals=True).num_keys
         128
     """
+    arguments = locals() | kernel_options
+    for name in ("kernel", "targets", "kernel_options"):
+        del arguments[name]
     if hasattr(kernel, "shape"):
         raise UserError(
             f"make_world: kernel: a {type(kernel).__name__}, expected a name; World(kernel, size, cost=..., t_max=...) "
             "takes a table"
         )
-    words = given({"kernel": kernel}) | _words(locals(), kernel_options)
+    words = given({"kernel": kernel}) | _words(arguments)
     if targets == 1:
         return modelled(make_problem(compose("compare", words)), f"kernel={kernel}")
     cfg = compose("solve", words | {"targets.count": targets})
@@ -144,22 +147,8 @@ def load_tracks(
     path: str | Path | Any,
     size: Size = default("grid.size"),
     *,
-    t_max: int = default("grid.t_max"),
-    cost: npt.ArrayLike | str = default("cost.sensor"),
-    safe_cost: float | None = default("cost.safe"),
-    reward: float = default("cost.reward"),
-    max_steps: int | None = default("grid.max_steps"),
-    window: int | None = default("grid.window"),
-    budget: int | None = default("cost.budget"),
-    detection: npt.ArrayLike | str = 1.0,
-    safe_detection: npt.ArrayLike | str = 1.0,
-    memory: str = default("task.memory"),
-    clip: int = default("task.clip"),
-    cell: float | None = default("grid.cell"),
-    origin: Sequence[float] | None = default("grid.origin"),
-    crs: str | None = default("grid.crs"),
     targets: int = 1,
-    **track_options: Any,
+    **options: Any,
 ) -> Recorded | Group:
     """Recorded tracks in place of a motion model: most to learn from, some to choose by, some held out to evaluate on.
 
@@ -169,26 +158,14 @@ def load_tracks(
             MOT-Challenge text; SUMO's fcd-output. Positions need `step` and `cell`; see `Recorded.loaded` for the
             counts of omitted ones, `Recorded.place` for where the grid lies. Or such a table as a DataFrame of pandas.
         size: N of an N x N grid, or (rows, columns).
-        t_max: see `make_world`, as for the following.
-        cost: c.
-        safe_cost: D.
-        reward: r.
-        max_steps: tracks are cut after so many steps; None: never.
-        window: W.
-        budget: B.
-        detection: p_d.
-        safe_detection: p_s.
-        memory: the policy's key at a detection: ``cell``, ``displacement``, ``displacement_gap`` or
-            ``two_displacements``.
-        clip: rows and columns up to which displacements are distinguished.
-        cell: see `make_world`; of positions the side of a cell is needed, the others follow from them.
-        origin: see `cell`.
-        crs: see `cell`.
         targets: K; above 1 the result is a `Group`, of which so many tracks are followed at once: those whose times
             overlap, or where the recording has no times any.
-        **track_options: those of ``kernel=tracks`` (``trackmdp train kernel=tracks --help``): `format`, `step`,
-            `columns` (a dict, or a list as there), `max_gap`, `ends`, `starts`, `held_out`, `validation`, `seed`,
-            `min_length`, `markov`.
+        **options: of `make_world` all but the kernel's own: `t_max`, `cost`, `safe_cost`, `reward`, `max_steps`, at
+            which tracks are cut, `window`, `budget`, `detection`, `safe_detection`, `clip`, `memory` (``cell``,
+            ``displacement``, ``displacement_gap`` or ``two_displacements``), and `cell`, `origin` and `crs`: of
+            positions the side of a cell is needed, the others follow from them. Those of ``kernel=tracks``
+            (``trackmdp train kernel=tracks --help``): `format`, `step`, `columns` (a dict, or a list as there),
+            `max_gap`, `ends`, `starts`, `held_out`, `validation`, `seed`, `min_length`, `markov`.
 
     Raises:
         UserError: the file is not of that form, a track is too short, or an option is wrong.
@@ -202,9 +179,9 @@ def load_tracks(
             f"load_tracks: a {type(path).__name__}, expected the path of a file, or a DataFrame"
         )
     source = "DataFrame.parquet" if in_memory else path  # a table of positions
-    if isinstance(named := track_options.get("columns"), Mapping):
-        track_options["columns"] = [f"{ours}:{theirs}" for ours, theirs in named.items()]
-    words = {"kernel": "tracks", "kernel.path": source} | _words(locals(), track_options)
+    if isinstance(named := options.get("columns"), Mapping):
+        options["columns"] = [f"{ours}:{theirs}" for ours, theirs in named.items()]
+    words = {"kernel": "tracks", "kernel.path": source} | _words({"size": size, **options})
     # `compare` has no option of several targets; `evaluate` takes them, and with a budget too where no sensor is on.
     of_several = {} if targets == 1 else {"targets.count": targets, "baseline": "none"}
     cfg = compose("evaluate" if of_several else "compare", words | of_several)
@@ -315,21 +292,22 @@ def paper_cost(
     }
 
 
-def _words(arguments: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments given to `make_world` or `load_tracks`, and the `own` options of a kernel, by command-line names.
+def _words(arguments: dict[str, Any]) -> dict[str, Any]:
+    """The arguments of `make_world` or `load_tracks`, and the options of a kernel among them, by command-line names.
 
     Raises:
         UserError: an option of no kernel resembles an argument.
     """
+    size, known = arguments["size"], OF_TASK | _OF_PLACE
+    missing = (_flat(p, arguments.pop(p, 1.0), size) for p in ("detection", "safe_detection"))
+    of_task = sensor_words(*missing) | {
+        known[name]: _flat(name, arguments.pop(name), size) for name in known if name in arguments
+    }
     of_kernels = {name for schema in GROUPS["kernel"].values() for name in options(schema)}
-    for name in own.keys() - of_kernels:
+    for name in arguments.keys() - of_kernels:
         if close := difflib.get_close_matches(name, OF_TASK, n=1):
             raise UserError(f"{name}: unknown argument, did you mean {close[0]}?")
-    arguments = {name: _flat(name, value, arguments["size"]) for name, value in arguments.items()}
-    of_task = {option: arguments[name] for name, option in (OF_TASK | _OF_PLACE).items()}
-    of_kernel = {f"kernel.{name}": value for name, value in own.items()}
-    of_sensor = sensor_words(arguments["detection"], arguments["safe_detection"])
-    return given(of_task | of_sensor | of_kernel)
+    return given(of_task | {f"kernel.{name}": value for name, value in arguments.items()})
 
 
 def _flat(name: str, value: Any, size: Size) -> Any:
