@@ -20,7 +20,7 @@ from torch.nn.functional import pad
 
 from trackmdp.solvers.cover import Shared
 from trackmdp.solvers.linear import IndexArray
-from trackmdp.world.entries import ranks, row_index
+from trackmdp.world.entries import padded_rows, ranks
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
@@ -138,9 +138,8 @@ def _lists(
     none: int,
 ) -> tuple[IndexArray, npt.NDArray[np.float32]]:
     """`[*shape, D]`, at `place` the `names` of the columns of each row of `matrix`, filled up with `none`; its data."""
-    row = row_index(matrix)
-    size = (*shape, max(1, int(np.diff(matrix.indptr).max(initial=0))))
-    table, data = np.full(size, none), np.zeros(size, dtype=np.float32)
-    entry = (place[0][row], place[1][row], np.arange(len(row)) - matrix.indptr[row])
-    table[entry], data[entry] = names[matrix.indices], matrix.data
+    columns, numbers = padded_rows(matrix, len(names))
+    table = np.full((*shape, columns.shape[1]), none)
+    data = np.zeros(table.shape, dtype=np.float32)
+    table[place], data[place] = np.append(names, none)[columns], numbers
     return table, data

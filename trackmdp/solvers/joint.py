@@ -60,9 +60,7 @@ class Joint:
 
     def __init__(self, world: World, detected: Array, revealed: list[Array]) -> None:
         # Cell M stands for no cell: a move to it has probability 0, its sensor costs and gains nothing.
-        to, p = padded_rows(world.kernel, world.num_cells)
-        self._to = np.pad(to, ((0, 1), (0, 0)), constant_values=world.num_cells)
-        self._p = np.pad(p, ((0, 1), (0, 0)))
+        self._to, self._p = padded_rows(world.kernel, world.num_cells, more=1)
         self._inside = np.append(world.stay_probability, 0.0)
         self._cost = np.append(world.prices, 0.0)
         self._revealed = [np.append(known, 0.0) for known in revealed]

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from trackmdp.world.entries import padded_rows
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
@@ -75,12 +76,5 @@ def _sensors_by_cell(task: Task) -> tuple[Tensor, Tensor]:
 
     Three cells covered by sensors 0, by 0 and 1, and by none of two give, with the exit, 0 2, 0 1, 2 2, 2 2.
     """
-    by_cell = task.sees_by_cell
-    degree = np.diff(by_cell.indptr)
-    shape = (task.num_cells + 1, int(degree.max()))
-    filled = np.append(degree, 0)[:, None] > np.arange(shape[1])
-    sensors = np.full(shape, task.total_sensors, dtype=np.int64)
-    sensors[filled] = by_cell.indices
-    misses = np.ones(shape)
-    misses[filled] = 1.0 - by_cell.data
-    return torch.as_tensor(sensors), torch.as_tensor(misses)
+    sensors, chance = padded_rows(task.sees_by_cell, task.total_sensors, more=1)
+    return torch.as_tensor(sensors), torch.as_tensor(1.0 - chance)

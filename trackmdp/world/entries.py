@@ -34,11 +34,13 @@ def summing(index: Numbers, count: int) -> sparse.csr_array:
     return ones_at(index, np.arange(len(index)), (count, len(index)), np.float64)
 
 
-def padded_rows(matrix: sparse.csr_array, none: int = 0) -> tuple[Numbers, npt.NDArray[np.float64]]:
-    """`[R, Z]` each, columns and numbers of the entries of each row, filled up with the column `none` and 0."""
+def padded_rows(
+    matrix: sparse.csr_array, none: int = 0, *, more: int = 0
+) -> tuple[Numbers, npt.NDArray[np.float64]]:
+    """Columns and numbers of the entries of each row, `[R + more, Z]` each, Z >= 1; filled up with `none` and 0."""
     rows, count = row_index(matrix), np.diff(matrix.indptr)
     place = rows, np.arange(matrix.nnz) - matrix.indptr[rows]
-    columns = np.full((matrix.shape[0], count.max(initial=0)), none)
+    columns = np.full((matrix.shape[0] + more, count.max(initial=1)), none)
     numbers = np.zeros(columns.shape)
     columns[place], numbers[place] = matrix.indices, matrix.data
     return columns, numbers
