@@ -88,6 +88,7 @@ def solve(
         "solve",
         named | own | given({f"partition.{name}": value for name, value in of_blocks.items()}),
     )
+    modelled(world.single, f"solver={cfg.solver.name}")
     if isinstance(world, Group):
         return solve_group(world, cfg.solver, on_progress, cfg.partition)
     solution = run_solver(world, cfg.solver, on_progress, cfg.partition)
@@ -108,7 +109,6 @@ def run_solver(
 
     From `start`, a known policy, those solvers begin that take one; the policy is then no worse.
     """
-    world = modelled(world, f"solver={choice.name}")
     if not world.tells_all or (world.modes > 1 and choice.name != "optimal"):
         return _modes(world, choice, start)
     if world.memory != "cell":  # the state is known at a detection: more of the past is of no use
@@ -151,7 +151,6 @@ def solve_group(
     partition: SweptPartitionConfig | None = None,
 ) -> GroupSolution:
     """Plans of single targets by a config's solver, and the bound for all of them together."""
-    modelled(group.single, f"solver={choice.name}")
     started = time.monotonic()
     singles = tuple(run_solver(world, choice, on_progress, partition) for world in group.kinds)
     upper = upper_bound(group)
