@@ -20,11 +20,10 @@ from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.group_bounds import equal_shares, upper_bound
 from trackmdp.solvers.group_chain import explored
 from trackmdp.solvers.group_value import evaluate_group
-from trackmdp.solvers.linear import IndexArray
 from trackmdp.solvers.merging import Beliefs, Clocks, make_rule
 from trackmdp.solvers.solve import solve
 from trackmdp.world.group import Group
-from trackmdp.world.model import Array, World
+from trackmdp.world.model import Array, IndexArray, World
 
 
 def tiny(seed: int, t_max: int = 0, **options: Any) -> World:

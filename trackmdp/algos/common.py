@@ -8,7 +8,6 @@ from inspect import signature
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -18,7 +17,7 @@ from trackmdp.config import TrainConfig
 from trackmdp.config.registry import maker
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.world.model import Task
+from trackmdp.world.model import AnyArray, Task
 
 
 class Algorithm(Protocol):
@@ -139,7 +138,7 @@ def tensors(arrays: Mapping[str, Any]) -> dict[str, Tensor]:
     return {name: torch.as_tensor(part) for name, part in arrays.items()}
 
 
-def arrays(tensors: Mapping[str, Tensor]) -> dict[str, npt.NDArray[Any]]:
+def arrays(tensors: Mapping[str, Tensor]) -> dict[str, AnyArray]:
     """The arrays of `tensors`, wherever a checkpoint was loaded to."""
     return {name: part.cpu().numpy() for name, part in tensors.items()}
 

@@ -42,8 +42,7 @@ from trackmdp.policies.acting import Exploring
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import generator
-from trackmdp.solvers.linear import IndexArray
-from trackmdp.world.model import Task
+from trackmdp.world.model import IndexArray, Task
 from trackmdp.world.windows import Window
 
 _MOST_CELLS_OF_NETS = 4_096

@@ -16,8 +16,7 @@ from trackmdp.algos.gains import chain_returns, clocked_advantage, gather, scatt
 from trackmdp.algos.in_view import SensorsInView
 from trackmdp.algos.path_replay import Replay
 from trackmdp.policies.nets import CellClockNet
-from trackmdp.solvers.linear import IndexArray
-from trackmdp.world.model import Task
+from trackmdp.world.model import IndexArray, Task
 from trackmdp.world.windows import Window
 
 # Weights of the clocks (`_weights`): the running mean gain moves a tenth of the way at each update; a clock with fewer

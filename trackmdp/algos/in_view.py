@@ -9,8 +9,6 @@ multilinear extension of coverage (Calinescu et al. 2011), with maxima at sets.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -19,9 +17,8 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from trackmdp.solvers.cover import Shared
-from trackmdp.solvers.linear import IndexArray
 from trackmdp.world.entries import padded_rows, ranks
-from trackmdp.world.model import Task
+from trackmdp.world.model import AnyArray, IndexArray, Task
 from trackmdp.world.windows import Window
 
 _CERTAIN = 1.0 - 2.0**-23
@@ -105,7 +102,7 @@ class SensorsInView(nn.Module):
         return pad(values, (0, 1)).gather(-1, index).view(*values.shape[:2], *places.shape[1:])
 
 
-def _own(task: Task, window: Window) -> dict[str, npt.NDArray[Any]]:
+def _own(task: Task, window: Window) -> dict[str, AnyArray]:
     """`numbers`, the cells of each window, and where sensors miss or are missing their p_d; 0 outside the grid."""
     cells = window.cells.cpu().numpy()
     chance = np.append(task.detection * task.available, 0.0).astype(np.float32)
@@ -114,7 +111,7 @@ def _own(task: Task, window: Window) -> dict[str, npt.NDArray[Any]]:
     )
 
 
-def _tables(task: Task, window: Window) -> dict[str, npt.NDArray[Any]]:
+def _tables(task: Task, window: Window) -> dict[str, AnyArray]:
     """`numbers`; the sensors of each cell `[M, C, D]` and the cells of each sensor `[M, K, F]`, with their p_d."""
     cells = window.cells.cpu().numpy()
     rows, local = np.nonzero(cells < task.num_cells)

@@ -19,11 +19,10 @@ from trackmdp.algos.estimates.censored import ObservedPaths, hidden_cells
 from trackmdp.algos.estimates.hidden_cells import Missed, redrawn
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.moves import known_as
-from trackmdp.solvers.linear import IndexArray
 from trackmdp.world.coverage import reported
 from trackmdp.world.entries import ones_at
-from trackmdp.world.model import Array, BoolArray, Task
-from trackmdp.world.tracks import Indices, Tracks, ends_of
+from trackmdp.world.model import Array, BoolArray, IndexArray, Indices, Task
+from trackmdp.world.tracks import Tracks, ends_of
 from trackmdp.world.windows import Window
 
 _ENDING = 8

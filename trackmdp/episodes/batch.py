@@ -8,20 +8,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from trackmdp.episodes.belief_filter import beliefs
-from trackmdp.episodes.episode import Episode, Floats, Integers, last_cells
+from trackmdp.episodes.episode import Episode, Floats, last_cells
 from trackmdp.episodes.episode_draws import Columns
 from trackmdp.episodes.grids import check_layers
 from trackmdp.episodes.showing import Showing
 from trackmdp.notebook.card import Card, decimal, grid_words, percent
 from trackmdp.policies.policy import Policy
-from trackmdp.world.model import Array, BoolArray
+from trackmdp.world.model import AnyArray, Array, BoolArray, Indices
 from trackmdp.world.tracks import Problem
 
 _BELIEF = 25_600  # cells, or hidden states, of the beliefs updated together: memory stays bounded on large grids
@@ -76,8 +75,8 @@ class Episodes(Showing[Episode]):
     problem: Problem
     policy: Policy | None
     seeds: Sequence[int]
-    start: Integers
-    first: Integers
+    start: Indices
+    first: Indices
     misses: npt.NDArray[np.int32]
     target: npt.NDArray[np.int32]
     located: BoolArray
@@ -87,7 +86,7 @@ class Episodes(Showing[Episode]):
     bits: npt.NDArray[np.uint8] | None
     key: npt.NDArray[np.int32] | None = None
     mode: npt.NDArray[np.int32] | None = None
-    start_mode: Integers | None = None
+    start_mode: Indices | None = None
 
     @classmethod
     def of(
@@ -160,11 +159,11 @@ class Episodes(Showing[Episode]):
             start_mode=0 if self.start_mode is None else int(self.start_mode[number]),
         )
 
-    def _keys(self, steps: slice, last_cell: Integers) -> Integers:
+    def _keys(self, steps: slice, last_cell: Indices) -> Indices:
         """`[T]`, the policy's key before each step."""
         return last_cell if self.key is None else self.key[steps].astype(np.int64)
 
-    def _action(self, steps: slice, key: Integers, misses: Integers) -> BoolArray:
+    def _action(self, steps: slice, key: Indices, misses: Indices) -> BoolArray:
         """`[T, S]`."""
         # A policy with a table needs no bits: its action follows from (key, misses), and S rows of M bits are not
         # kept.
@@ -184,7 +183,7 @@ class Episodes(Showing[Episode]):
         # Sensors are counted where they cost: not at the exit, nor where the safe action replaced them.
         chosen = self.sensors * (in_grid & ~forced)
         every = np.ones(len(self.target))
-        columns: list[npt.NDArray[Any]] = [
+        columns: list[AnyArray] = [
             self.reward,
             in_grid,
             self.located,

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.episodes.episode import Episode, Floats, Integers
+from trackmdp.episodes.episode import Episode, Floats
 from trackmdp.policies.belief import BeliefFilter
 from trackmdp.world.coverage import reported
-from trackmdp.world.model import BoolArray, Task, World
+from trackmdp.world.model import AnyArray, BoolArray, Indices, Task, World
 
 
 def beliefs(world: World, episodes: Sequence[Episode]) -> list[Floats]:
@@ -51,7 +49,7 @@ def beliefs(world: World, episodes: Sequence[Episode]) -> list[Floats]:
     return np.split(found, first[1:])
 
 
-def _reports(world: Task) -> Callable[[BoolArray, Integers], npt.NDArray[Any]]:
+def _reports(world: Task) -> Callable[[BoolArray, Indices], AnyArray]:
     """Of actions `[B, S]` and n `[B]` the probability `[B, M]` that a step reports a target in each cell.
 
     Where reports are certain it is the action itself, a bool. It is asked for step by step: of all steps at once it
@@ -61,7 +59,7 @@ def _reports(world: Task) -> Callable[[BoolArray, Integers], npt.NDArray[Any]]:
         return lambda action, _: world.covered(action)
     seen_by = sparse.csr_array(world.sees_by_cell.T)
 
-    def chance(action: BoolArray, misses: Integers) -> npt.NDArray[Any]:
+    def chance(action: BoolArray, misses: Indices) -> AnyArray:
         seen = reported(sparse.csr_array(action.astype(np.float64)), seen_by).toarray()
         return np.where(misses[:, None] > world.t_max, world.safe_detection, seen)
 

@@ -13,11 +13,10 @@ import torch
 from tensordict import TensorDict
 
 from trackmdp.notebook.card import Card, Carded, Facts, decimal
-from trackmdp.world.model import BoolArray, Task
+from trackmdp.world.model import AnyArray, Array, BoolArray, Indices, Task
 from trackmdp.world.windows import Window
 
 Floats: TypeAlias = npt.NDArray[np.float32]
-Integers: TypeAlias = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,37 +45,37 @@ class Recording(Carded):
     seed: int
     policy: int
     start: Any
-    misses: Integers
+    misses: Indices
     action: BoolArray
-    target: Integers
+    target: Indices
     located: BoolArray
     reward: Floats
     terminated: bool
     truncated: bool = False
     belief: Any = None
-    mode: Integers | None = None
+    mode: Indices | None = None
     first_tick: int | None = None
 
     def __len__(self) -> int:
         return len(self.target)
 
     @cached_property
-    def observation(self) -> Integers:
+    def observation(self) -> Indices:
         """`[T]` the cell in which the target was located by the step, -1 if in none; of K targets `[T, K]`."""
         return np.where(self.located, self.target, -1)
 
     @property
-    def last_cell(self) -> Integers:
+    def last_cell(self) -> Indices:
         """`[T]` cell of the last detection before the step, x_{l(k)}; of K targets `[T, K]`."""
         return self._last_cells[:-1]
 
     @cached_property
-    def _last_cells(self) -> Integers:
+    def _last_cells(self) -> Indices:
         """`[T + 1]`, also after the last step."""
         return last_cells(self.start, self.target, self.located)
 
     @cached_property
-    def returns(self) -> npt.NDArray[np.float64]:
+    def returns(self) -> Array:
         """`[T]` reward summed up to and with the step."""
         return np.cumsum(self.reward, dtype=np.float64)
 
@@ -114,7 +113,7 @@ class Recording(Carded):
         return Card(f"Episode: number {self.number}, seed {self.seed}", facts)
 
     def _transitions(
-        self, task: Task, states: dict[str, npt.NDArray[Any]], action: BoolArray
+        self, task: Task, states: dict[str, AnyArray], action: BoolArray
     ) -> TensorDict:
         """See `to_tensordict`; of the T + 1 `states` the last has no action, and the first is no outcome."""
         if task.max_steps:
@@ -181,7 +180,7 @@ class Episode(Recording):
         return self._transitions(task, states, action)
 
 
-def _history(action: BoolArray, misses: Integers, located: BoolArray, t_max: int) -> BoolArray:
+def _history(action: BoolArray, misses: Indices, located: BoolArray, t_max: int) -> BoolArray:
     """`[T+1, t_max+1, K]` h in each state: slot s holds the action at s misses, empty from slot n on.
 
     That is the action of the s-th step after the last detection, from 0 on; the safe action, however often it is
@@ -197,7 +196,7 @@ def _history(action: BoolArray, misses: Integers, located: BoolArray, t_max: int
     return action[np.where(filled, steps, 0)] & filled[..., None]
 
 
-def last_cells(start: Any, target: Integers, located: BoolArray) -> Integers:
+def last_cells(start: Any, target: Indices, located: BoolArray) -> Indices:
     """`[T + 1]` cell of the last detection before each step of an episode, and after the last one; or `[T + 1, K]`.
 
     With detections at steps 1 and 3 of five, `latest` is -1 -1 1 1 3 3.

@@ -15,8 +15,7 @@ from trackmdp.seeding import derive
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.evaluation import ReplayedTracks
 from trackmdp.solvers.false_alarms import check_alarms
-from trackmdp.solvers.linear import IndexArray
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.model import Array, BoolArray, IndexArray, World
 from trackmdp.world.tracks import Problem
 
 _NEVER = 1e-12

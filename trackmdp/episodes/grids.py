@@ -12,12 +12,11 @@ from collections.abc import Iterator, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from trackmdp.episodes.episode import Episode, Floats
 from trackmdp.episodes.schema import clock_of, json_bytes
 from trackmdp.machine import check_free
-from trackmdp.world.model import BoolArray
+from trackmdp.world.model import AnyArray, BoolArray
 
 WHOLE_CELLS = 64 * 64
 """Cells up to which belief and policy are written whole; of a larger grid, where either is more than 0."""
@@ -87,7 +86,7 @@ def grid_messages(
         }
 
 
-_Layer: TypeAlias = tuple[npt.NDArray[Any], Box]
+_Layer: TypeAlias = tuple[AnyArray, Box]
 
 
 def _layers(
@@ -155,15 +154,13 @@ def boxes_of(used: BoolArray) -> Iterator[Box]:
     return zip(*(each.tolist() for each in ends), strict=True)
 
 
-def boxed(stamp: bytes, says: bytes, cells: npt.NDArray[Any], box: Box, z: float) -> bytes:
+def boxed(stamp: bytes, says: bytes, cells: AnyArray, box: Box, z: float) -> bytes:
     """The message of the part `box` of a layer `[R, C]`."""
     top, bottom, left, right = box
     return grid_text(stamp, says, cells[top:bottom, left:right], left, len(cells) - bottom, z)
 
 
-def grid_text(
-    stamp: bytes, says: bytes, cells: npt.NDArray[Any], x: float, y: float, z: float
-) -> bytes:
+def grid_text(stamp: bytes, says: bytes, cells: AnyArray, x: float, y: float, z: float) -> bytes:
     """The message of `cells` `[R, C]` with the lowest left corner at (x, y, z)."""
     columns, stride = cells.shape[1], cells.dtype.itemsize
     # turned upside down, since a viewer's first row is the lowest
@@ -201,7 +198,7 @@ def check_layers(steps: int, cells: int) -> None:
 
 def read_grid(
     text: bytes, size: tuple[int, int], cell: np.dtype[Any]
-) -> tuple[tuple[slice, slice], npt.NDArray[Any]]:
+) -> tuple[tuple[slice, slice], AnyArray]:
     """The part of the grid that a message is of, and what it says of its cells.
 
     Raises:

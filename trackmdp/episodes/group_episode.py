@@ -11,9 +11,9 @@ import numpy.typing as npt
 from scipy import sparse
 from tensordict import TensorDict
 
-from trackmdp.episodes.episode import Episode, Integers, Recording
+from trackmdp.episodes.episode import Episode, Recording
 from trackmdp.notebook.card import Card
-from trackmdp.world.model import BoolArray, Task
+from trackmdp.world.model import AnyArray, BoolArray, Indices, Task
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -24,7 +24,7 @@ class GroupEpisode(Recording):
         belief: `[T · K, M]` sparse: row t · K + k is of target k; it sums to the probability that it has not left.
     """
 
-    start: Integers
+    start: Indices
     belief: sparse.csr_array | None = None
 
     def card(self) -> Card:
@@ -64,7 +64,7 @@ class GroupEpisode(Recording):
         seen = self.located
         more = np.minimum(self.misses[-1] + 1, task.t_max + 1)
         misses = np.append(self.misses, np.where(seen[-1] | gone[-1], 0, more)[None])
-        states: dict[str, npt.NDArray[Any]] = {
+        states: dict[str, AnyArray] = {
             "last_cell": np.where(self._last_cells < task.num_cells, self._last_cells, 0),
             "steps_since_detection": misses.reshape(gone.shape),
             "present": ~gone,

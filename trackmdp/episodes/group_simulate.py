@@ -12,10 +12,9 @@ from torch import Tensor
 
 from trackmdp.episodes.episode_draws import Columns, Draws, joined, uniform
 from trackmdp.episodes.group_episode import GroupEpisode
-from trackmdp.solvers.linear import IndexArray
 from trackmdp.solvers.merging import Beliefs, Clocks, Rule, followed
 from trackmdp.world.group_paths import GroupPaths, group_paths
-from trackmdp.world.model import BoolArray
+from trackmdp.world.model import BoolArray, IndexArray
 from trackmdp.world.outcomes import Costs
 
 AT_ONCE = 4096

@@ -12,17 +12,15 @@ import tty
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
 from trackmdp.episodes.episode import Recording
 from trackmdp.episodes.sentences import sentence
-from trackmdp.world.model import Task
+from trackmdp.world.model import IndexArray, Task
 from trackmdp.world.render import (
     FOUND,
     FOUND_OF_SEVERAL,
@@ -74,7 +72,7 @@ def _middle(episode: Recording, steps: Iterable[int], task: Task) -> tuple[int, 
     return _amid(next((each for each in inside if len(each)), np.atleast_1d(episode.start)), task)
 
 
-def _amid(cells: npt.NDArray[np.integer[Any]], task: Task) -> tuple[int, int]:
+def _amid(cells: IndexArray, task: Task) -> tuple[int, int]:
     """Row and column in the middle of some cells."""
     way = np.array(np.divmod(cells, task.columns))
     row, column = ((way.min(1) + way.max(1)) // 2).tolist()

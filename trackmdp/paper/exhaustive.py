@@ -8,15 +8,14 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-import numpy.typing as npt
 
 from trackmdp.policies.table import PolicyTable
-from trackmdp.world.model import Array, World
+from trackmdp.world.model import Array, Indices, World
 
 _SETTLED = 1e-14
 
 
-def cell_of_state(world: World) -> npt.NDArray[np.int64]:
+def cell_of_state(world: World) -> Indices:
     """`[Z]` the cell of each state of the kernel."""
     states = world.kernel.shape[0]
     return np.arange(states) // (states // world.num_cells)

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
-
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.world.model import Array
-
-IndexArray: TypeAlias = npt.NDArray[np.int64]
+from trackmdp.world.model import AnyArray, Array, Indices
 
 
 class BeliefFilter:
@@ -34,7 +29,7 @@ class BeliefFilter:
         return found
 
     def detect(
-        self, cell: IndexArray, mode: IndexArray | None = None, predicted: Array | float = 1.0
+        self, cell: Indices, mode: Indices | None = None, predicted: Array | float = 1.0
     ) -> Array:
         """Condition `predicted` `[B, Z]`, by default every state alike, on a detection.
 
@@ -52,7 +47,7 @@ class BeliefFilter:
         # an episode differ in the last bit when it is simulated again alone.
         return np.ascontiguousarray((self._into @ np.ascontiguousarray(belief.T)).T)
 
-    def miss(self, predicted: Array, report: npt.NDArray[Any]) -> Array:
+    def miss(self, predicted: Array, report: AnyArray) -> Array:
         """Condition `predicted` `[B, Z]` on no detection and no exit.
 
         `report` `[B, M]` is the probability of a report from each cell: whether a sensor is on, or p_d of one that may
@@ -63,7 +58,7 @@ class BeliefFilter:
         return _conditioned(unseen, predicted)
 
 
-def _conditioned(weight: Array, otherwise: npt.NDArray[Any]) -> Array:
+def _conditioned(weight: Array, otherwise: AnyArray) -> Array:
     """Rows scaled to sum 1; a row of zeros is replaced by that of `otherwise`."""
     chosen = np.where(weight.sum(axis=1, keepdims=True) > 0, weight, otherwise)
     # The least number keeps 0 / 0 out, of a target that has certainly left.

@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from trackmdp.durable import write_bytes, write_json
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.untrusted import LARGE, decoded, load_npz, opened, read_object
 from trackmdp.world.files import npz_bytes, whole_csr
-from trackmdp.world.model import Array, Task
+from trackmdp.world.model import AnyArray, Array, Task
 from trackmdp.world.problem_file import as_arrays, from_arrays
 
 LISTED_CELLS, LISTED_NUMBERS = 20_000, 2**21
@@ -73,7 +72,7 @@ def packed(policy: PolicyTable) -> dict[str, Any]:
     return content if policy.k is None else content | {"k": np.int64(policy.k)}
 
 
-def unpacked_policy(task: Task, content: Mapping[str, npt.NDArray[Any]]) -> PolicyTable:
+def unpacked_policy(task: Task, content: Mapping[str, AnyArray]) -> PolicyTable:
     """The policy of `packed` arrays.
 
     Raises:

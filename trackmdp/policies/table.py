@@ -18,7 +18,7 @@ from trackmdp.notebook.card import Card, Carded, decimal, grid_words
 from trackmdp.world.coverage import reported, shared_out
 from trackmdp.world.entries import ones_at, row_index
 from trackmdp.world.kernel_checks import short_indices
-from trackmdp.world.model import Array, BoolArray, Task, window_cells
+from trackmdp.world.model import AnyArray, Array, BoolArray, Task, window_cells
 
 _AT_ONCE = 2**19
 """Entries looked up at once: some 16 MB of intermediate arrays, however large the grid."""
@@ -58,13 +58,13 @@ class SetTable:
             return self
         return SetTable(task, self.sets, self.plans, probability=self.probability, k=self.k)
 
-    def chosen(self, n: int, plans: npt.NDArray[Any], sensors: npt.NDArray[Any]) -> Array:
+    def chosen(self, n: int, plans: AnyArray, sensors: AnyArray) -> Array:
         """`[E]` probability that `sensors` `[E]` are on, after n misses in each plan `[E]`."""
         if self.sets is None:
             return np.full(len(plans), float(self.probability or 0.0))
         return self._looked_up(self.sets, n, plans, sensors)
 
-    def reports(self, n: int, plans: npt.NDArray[Any], cells: npt.NDArray[Any]) -> Array:
+    def reports(self, n: int, plans: AnyArray, cells: AnyArray) -> Array:
         """`[E]` probability that a target in `cells` `[E]` is reported after n misses in each plan."""
         task = self.task
         if task.coverage is None:
@@ -74,7 +74,7 @@ class SetTable:
         return self._looked_up(self.reporting, n, plans, cells)
 
     def _looked_up(
-        self, table: sparse.csr_array, n: int, plans: npt.NDArray[Any], columns: npt.NDArray[Any]
+        self, table: sparse.csr_array, n: int, plans: AnyArray, columns: AnyArray
     ) -> Array:
         """`[E]`, the entries of row plan (t_max + 1) + n of a table in `columns`."""
         found = np.empty(len(columns))
@@ -231,9 +231,7 @@ class PolicyTable(Carded, SetTable):
         )
 
     @classmethod
-    def from_sensed(
-        cls, task: Task, parts: Sequence[tuple[npt.NDArray[Any], npt.NDArray[Any]]]
-    ) -> Self:
+    def from_sensed(cls, task: Task, parts: Sequence[tuple[AnyArray, AnyArray]]) -> Self:
         """A policy that does not draw, from the keys and their sensors on, `[Q]` each, at n = 0 ... t_max."""
         # Key x after n misses is row x (t_max + 1) + n: with t_max = 1, (x, n) = (3, 1) is row 7.
         # rows of several n interleave, so that the table is sorted once all are there

@@ -7,10 +7,7 @@ take the place of the M cells.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy import sparse
 from tensordict import TensorDict
@@ -28,7 +25,7 @@ from trackmdp.policies.forms import (
 )
 from trackmdp.seeding import preserved_global_rng
 from trackmdp.world.actions import ActionMask
-from trackmdp.world.model import Task
+from trackmdp.world.model import AnyArray, Task
 from trackmdp.world.windows import Window
 
 _HISTORY_AT_ONCE = 2**22
@@ -167,7 +164,7 @@ def _table(
     return sparse.csr_array(found, shape=(task.num_keys * choices, task.total_sensors))
 
 
-def _followed(rule: Rule, task: Task, keys: Tensor, dtype: torch.dtype) -> npt.NDArray[Any]:
+def _followed(rule: Rule, task: Task, keys: Tensor, dtype: torch.dtype) -> AnyArray:
     """`[B, t_max+1, K]` the answers at n = 0, 1, ... misses after detections that left `keys` `[B]`."""
     cells, choices, known = task.keys.cell(keys), task.num_choices, (keys,) if task.keyed else ()
     # Slot n is written after the call for n: at n misses the rule sees slots 0 ... n - 1, as in the environment.

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.solvers.choose import Decisions, Own, priced
@@ -26,7 +24,7 @@ from trackmdp.solvers.linear import (
 )
 from trackmdp.solvers.sensing import sensing
 from trackmdp.world.entries import row_index, with_data
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.model import AnyArray, Array, BoolArray, World
 
 
 @dataclass(frozen=True)
@@ -314,7 +312,7 @@ def _value(world: World, choices: _Choices, guess: Array | None = None) -> tuple
     return np.stack(table, axis=1), system.exact
 
 
-def _masked(moves: sparse.csr_array, keep: npt.NDArray[Any]) -> sparse.csr_array:
+def _masked(moves: sparse.csr_array, keep: AnyArray) -> sparse.csr_array:
     kept = with_data(moves, moves.data * keep).copy()
     kept.eliminate_zeros()
     return kept

@@ -37,9 +37,9 @@ from trackmdp.solvers.choices import Choices, Frontier, LeftOut, Origin, sets_le
 from trackmdp.solvers.delayed import Delayed
 from trackmdp.solvers.inner import InnerProblem
 from trackmdp.solvers.joint import Joint
-from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.solvers.linear import per_row
 from trackmdp.world.entries import row_index, with_data
-from trackmdp.world.model import Array, BoolArray
+from trackmdp.world.model import Array, BoolArray, IndexArray
 
 # Choices under one heap entry: enough of them for array arithmetic to pay, and not so many that poor ones are expanded
 # along with the best one, which gives the batch its place in the heap.

@@ -8,9 +8,8 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.solvers.joint import Next
-from trackmdp.solvers.linear import IndexArray
 from trackmdp.world.entries import among, row_index
-from trackmdp.world.model import Array, BoolArray
+from trackmdp.world.model import Array, BoolArray, IndexArray
 
 
 @dataclass(frozen=True)

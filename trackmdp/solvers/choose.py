@@ -17,15 +17,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.solvers.linear import per_row
 from trackmdp.world.entries import ranks, summing
-from trackmdp.world.model import Array, BoolArray, Task
+from trackmdp.world.model import AnyArray, Array, BoolArray, IndexArray, Task
 
 TIE = 1e-12
 """Relative slack of a threshold: gains equal to a price but for rounding count as equal to it."""
@@ -64,7 +62,7 @@ class Decisions(ABC):
         """
 
     @abstractmethod
-    def report(self, on: BoolArray) -> npt.NDArray[Any]:
+    def report(self, on: BoolArray) -> AnyArray:
         """`[E, C]` probability that the set `on` `[G, C]` reports a target there; bool where no sensor misses."""
 
     @abstractmethod
@@ -157,7 +155,7 @@ class Own(Decisions):
         assert self.budget is not None
         return on & largest(self.rows, np.where(on, net, -np.inf), self.budget)
 
-    def report(self, on: BoolArray) -> npt.NDArray[Any]:
+    def report(self, on: BoolArray) -> AnyArray:
         """See `Decisions`."""
         there = on if self.group is None else on[self.group]
         return there if self.chance is None else there * self.chance

@@ -22,17 +22,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.errors import UserError
 from trackmdp.solvers.choose import TIE, Decisions
-from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.solvers.linear import per_row
 from trackmdp.world.entries import row_index, summing, with_data
-from trackmdp.world.model import Array, BoolArray, Task
+from trackmdp.world.model import AnyArray, Array, BoolArray, IndexArray, Task
 
 _PROVED = 1e-9
 """Part of the possible gain up to which a set counts as the best: rounding of linear and integer programs."""
@@ -118,11 +116,11 @@ class Shared(Decisions):
         p = np.minimum(self.sees.data, _CERTAIN)
         return with_data(self.sees, self.sees.data / (1.0 - p))
 
-    def _unreported(self, on: npt.NDArray[Any]) -> Array:
+    def _unreported(self, on: AnyArray) -> Array:
         """`[E, C]` probability that no sensor of `on` `[G, C]` reports an entry."""
         return np.exp(self._logs @ on.astype(np.float64))
 
-    def report(self, on: BoolArray) -> npt.NDArray[Any]:
+    def report(self, on: BoolArray) -> AnyArray:
         """See `Decisions`."""
         if self.perfect:
             return self.sees.T @ on.astype(np.float64) > 0

@@ -28,9 +28,9 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.solvers.choices import LeftOut
-from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.solvers.linear import per_row
 from trackmdp.world.entries import padded_rows, row_index
-from trackmdp.world.model import Array, World
+from trackmdp.world.model import Array, IndexArray, World
 
 STEPS = 6
 """Subgradient steps. On a walk (c = .3, T_max 3) the tables by themselves leave .059 per step open after one of them,

@@ -15,11 +15,11 @@ import numpy as np
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.inner import InnerProblem
 from trackmdp.solvers.known import tables, up_to
-from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.solvers.linear import per_row
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.value import key_visits, value_of
 from trackmdp.solvers.walk import Step
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.model import Array, BoolArray, IndexArray, World
 
 _MOST_NODES = 100_000
 """Choices looked at per table; where it ends early, W is an upper bound, and the exact form is exact all the same."""

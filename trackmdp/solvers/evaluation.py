@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from trackmdp.notebook.card import Card, Carded, Facts, decimal, percent
 from trackmdp.statistics import MeanInterval, ratio
-from trackmdp.world.model import Array
-
-IndexArray: TypeAlias = npt.NDArray[np.integer[Any]]
+from trackmdp.world.model import Array, IndexArray
 
 
 @dataclass(frozen=True, repr=False)

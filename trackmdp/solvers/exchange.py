@@ -25,7 +25,7 @@ from scipy import sparse
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers.bounds import one_set
-from trackmdp.solvers.linear import IndexArray, forced_worth, per_row
+from trackmdp.solvers.linear import forced_worth, per_row
 from trackmdp.solvers.plans import Layout, Plans, Turn
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import (
@@ -38,7 +38,7 @@ from trackmdp.solvers.search import (
     risen,
     shares,
 )
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.model import Array, BoolArray, IndexArray, World
 
 MOST_NUMBERS = 2**17
 """Numbers in one array of a part, 1 MB: larger parts leave the caches, and took twice the time."""

@@ -15,9 +15,9 @@ from scipy import sparse
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation, pooled
-from trackmdp.solvers.linear import IndexArray, RenewalSystem, per_row
+from trackmdp.solvers.linear import RenewalSystem, per_row
 from trackmdp.solvers.walk import Events, Passed, Step, Walk, all_events, passed, transition
-from trackmdp.world.model import Array, World
+from trackmdp.world.model import Array, IndexArray, World
 from trackmdp.world.tracks import Problem, modelled
 
 _MOST_CELLS = 144

@@ -10,10 +10,10 @@ from typing import TypeAlias
 import numpy as np
 from scipy import sparse
 
-from trackmdp.solvers.linear import IndexArray, summed_over
+from trackmdp.solvers.linear import summed_over
 from trackmdp.solvers.merging import Beliefs, Clocks, Rule
 from trackmdp.world.group import Group
-from trackmdp.world.model import Array
+from trackmdp.world.model import Array, IndexArray
 
 MOST_STATES = 2_000
 """Joint states up to which a policy is valued exactly: a second or two."""

@@ -16,10 +16,10 @@ from trackmdp.errors import UserError
 from trackmdp.seeding import derive
 from trackmdp.solvers.group_chain import joint_chain
 from trackmdp.solvers.group_figures import GroupEvaluation
-from trackmdp.solvers.linear import IndexArray, accumulate, grid_of, summed_over
+from trackmdp.solvers.linear import accumulate, grid_of, summed_over
 from trackmdp.solvers.merging import Beliefs, Clocks, Reports, Rule, followed
 from trackmdp.world.entries import among
-from trackmdp.world.model import Array, BoolArray
+from trackmdp.world.model import Array, BoolArray, IndexArray
 
 _FIRST = 64
 """Episodes of the first batch, from which the number needed for the wanted width is worked out."""

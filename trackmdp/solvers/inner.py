@@ -10,12 +10,12 @@ from functools import cached_property
 
 import numpy as np
 
-from trackmdp.solvers.linear import IndexArray, forced_worth
+from trackmdp.solvers.linear import forced_worth
 from trackmdp.solvers.plans import Layout, Plans, Turn
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import candidates_of, columns_of
 from trackmdp.solvers.sensing import sensing
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.model import Array, BoolArray, IndexArray, World
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,9 +26,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trackmdp.solvers.linear import IndexArray
 from trackmdp.world.entries import padded_rows
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.model import Array, BoolArray, IndexArray, World
 
 MOST_ENTRIES = 1 << 15
 """Entries b_ji handled at once: a quarter of a megabyte stays in the cache."""

@@ -17,11 +17,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from trackmdp.durable import write_bytes
 from trackmdp.errors import UserError
 from trackmdp.solvers.group_tracker import GroupTracker
-from trackmdp.solvers.linear import IndexArray
 from trackmdp.solvers.merging import Beliefs, Clocks, Rule
 from trackmdp.world.files import npz_bytes
 from trackmdp.world.group import Group
-from trackmdp.world.model import Array, BoolArray
+from trackmdp.world.model import Array, BoolArray, IndexArray
 
 
 class JointRule(Rule):

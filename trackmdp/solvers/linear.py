@@ -10,10 +10,8 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from functools import cached_property, lru_cache
-from typing import Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from scipy.linalg.blas import daxpy
 from scipy.linalg.lapack import dgetrf, dgetrs
@@ -22,9 +20,7 @@ from scipy.sparse.linalg import splu, spsolve_triangular
 from trackmdp.errors import UserError
 from trackmdp.world.entries import summing
 from trackmdp.world.kernel_checks import short_indices
-from trackmdp.world.model import Array, World
-
-IndexArray: TypeAlias = npt.NDArray[np.integer[Any]]
+from trackmdp.world.model import Array, IndexArray, World
 
 DIRECT_CELLS = 20_000
 """Cells up to which systems are factorised. The factors of a grid fill about M^1.4 entries: 75 a cell at M = 16,384."""

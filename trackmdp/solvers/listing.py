@@ -21,10 +21,9 @@ import numpy as np
 
 from trackmdp.solvers.choose import Own
 from trackmdp.solvers.cover import Shared
-from trackmdp.solvers.linear import IndexArray
 from trackmdp.solvers.plans import Plans
 from trackmdp.world.entries import ranks
-from trackmdp.world.model import Array, BoolArray
+from trackmdp.world.model import Array, BoolArray, IndexArray
 
 _MOST_BITS = 14
 """Sensors of a row in all sets but the last up to which all choices are listed; with a budget 2^14 choices."""

@@ -28,11 +28,11 @@ from trackmdp.errors import UserError
 from trackmdp.policies.saved import packed
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.choose import largest
-from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.solvers.linear import per_row
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.world.entries import among
 from trackmdp.world.group import Group
-from trackmdp.world.model import Array, BoolArray
+from trackmdp.world.model import Array, BoolArray, IndexArray
 
 
 @dataclass(frozen=True)

@@ -25,11 +25,10 @@ from trackmdp.config.by_blocks import PartitionConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation
-from trackmdp.solvers.linear import IndexArray
 from trackmdp.solvers.workers import Crew, Made, in_turn
 from trackmdp.world.displacements import apart, cell_at
 from trackmdp.world.entries import row_index
-from trackmdp.world.model import BoolArray, World
+from trackmdp.world.model import BoolArray, IndexArray, World
 
 Planner: TypeAlias = "Callable[[int, World], PolicyTable]"
 """From a block's number and its world to its policy, by planning or by learning."""

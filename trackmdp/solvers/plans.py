@@ -19,9 +19,8 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.solvers.choose import Decisions
-from trackmdp.solvers.linear import IndexArray
 from trackmdp.world.entries import summing
-from trackmdp.world.model import Array, BoolArray
+from trackmdp.world.model import Array, BoolArray, IndexArray
 
 
 @dataclass(frozen=True, eq=False)

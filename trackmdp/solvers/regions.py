@@ -24,13 +24,13 @@ from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.exchange import exchange, hopeful, revealed
 from trackmdp.solvers.inner import InnerProblem
 from trackmdp.solvers.known import adopted, planted
-from trackmdp.solvers.linear import DIRECT_CELLS, IndexArray, forced_worth
+from trackmdp.solvers.linear import DIRECT_CELLS, forced_worth
 from trackmdp.solvers.partition import Pairs, blocks, cells_of, end_to_end, reach, sub_world, within
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import candidates_of, columns_of
 from trackmdp.solvers.value import value_of
 from trackmdp.solvers.workers import Crew, Made, in_turn
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.model import Array, BoolArray, IndexArray, World
 
 ROOM, SMALLEST_SIDE, LARGEST_SIDE = 2**28, 32, 128
 """Bytes of a region, and its located cells in each direction, unless there is less memory. Wider ones have a smaller

@@ -9,22 +9,21 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
-from typing import Any, TypeAlias, cast
+from typing import TypeAlias, cast
 
 import numpy as np
-import numpy.typing as npt
 
 from trackmdp.machine import check_free
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.choose import Decisions
-from trackmdp.solvers.linear import DIRECT_CELLS, TOLERANCE, IndexArray, RenewalSystem, per_row
+from trackmdp.solvers.linear import DIRECT_CELLS, TOLERANCE, RenewalSystem, per_row
 from trackmdp.solvers.plans import Layout, Plans, Turn
 from trackmdp.solvers.sensing import sensing
 from trackmdp.solvers.value import event_system, first_events, solved, whole_renewals
 from trackmdp.solvers.walk import Events, Passed, Step, Walk, all_events, passed
 from trackmdp.world.entries import ones_at
 from trackmdp.world.memory import KeySpace
-from trackmdp.world.model import Array, BoolArray, Task, World
+from trackmdp.world.model import AnyArray, Array, BoolArray, IndexArray, Task, World
 from trackmdp.world.motion import Motion
 
 _DIRECT = 1_500
@@ -36,7 +35,7 @@ _SAMPLED = 256
 """Hidden states on which the memory of a renewal is estimated."""
 
 
-Act: TypeAlias = tuple[npt.NDArray[Any], Array]
+Act: TypeAlias = tuple[AnyArray, Array]
 """One free choice: `[E]` probability of a report of each entry, `[B]` price of the set after each event."""
 
 

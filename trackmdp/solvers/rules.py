@@ -15,10 +15,10 @@ import numpy as np
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.choose import TIE
-from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.solvers.linear import per_row
 from trackmdp.solvers.sensing import sensing
 from trackmdp.solvers.walk import Step, Walk, all_events
-from trackmdp.world.model import Array, World
+from trackmdp.world.model import Array, IndexArray, World
 
 
 @dataclass(frozen=True)

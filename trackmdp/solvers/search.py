@@ -18,11 +18,11 @@ import numpy as np
 
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked_table
-from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.solvers.linear import per_row
 from trackmdp.solvers.plans import Plans
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.value import solved, visits_of
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.model import Array, BoolArray, IndexArray, World
 
 _ALONE = 16
 """Rows to try one by one where no larger part of the changes raises the AIHTR."""

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from trackmdp.solvers.choose import Decisions, Own
 from trackmdp.solvers.cover import Shared
-from trackmdp.solvers.linear import IndexArray
-from trackmdp.world.model import Task
+from trackmdp.world.model import IndexArray, Task
 
 
 def sensing(

@@ -23,7 +23,6 @@ from trackmdp.solvers.evaluation import Evaluation, ReplayedTracks, by_start, po
 from trackmdp.solvers.linear import (
     DIRECT_CELLS,
     TOLERANCE,
-    IndexArray,
     RenewalSystem,
     accumulate,
     check_length,
@@ -34,7 +33,7 @@ from trackmdp.solvers.linear import (
 )
 from trackmdp.solvers.walk import Events, Passed, Walk, all_events, passed
 from trackmdp.world.entries import summing
-from trackmdp.world.model import Array, BoolArray, Task, World
+from trackmdp.world.model import Array, BoolArray, IndexArray, Task, World
 from trackmdp.world.motion import Motion
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 

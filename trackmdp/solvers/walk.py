@@ -24,9 +24,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.solvers.linear import per_row
 from trackmdp.world.memory import KeySpace
-from trackmdp.world.model import Array, BoolArray, Task
+from trackmdp.world.model import Array, BoolArray, IndexArray, Indices, Task
 from trackmdp.world.motion import Motion
 
 FIGURES = ("reward", "steps", "detections", "sensors", "safe actions", "length")
@@ -45,7 +45,7 @@ class Events:
 
     keys: KeySpace
     states: int
-    codes: npt.NDArray[np.int64]
+    codes: Indices
 
     @cached_property
     def forced(self) -> int:
@@ -68,14 +68,12 @@ class Events:
         return self.keys.order == 0 and len(self.codes) == self.states * (1 + (self.forced > 0))
 
 
-def detected_codes(keys: KeySpace, key: IndexArray, state: IndexArray) -> npt.NDArray[np.int64]:
+def detected_codes(keys: KeySpace, key: IndexArray, state: IndexArray) -> Indices:
     """`[E]`, see `Events`."""
     return state.astype(np.int64) * keys.num_keys + key
 
 
-def forced_codes(
-    keys: KeySpace, states: int, key: IndexArray | None, state: IndexArray
-) -> npt.NDArray[np.int64]:
+def forced_codes(keys: KeySpace, states: int, key: IndexArray | None, state: IndexArray) -> Indices:
     """`[E]`, see `Events`; what the next key does not depend on counts as 0, without `key` all of it."""
     if key is not None and keys.order == 1:  # the next one depends on the last located cell alone
         key = keys.start(keys.cell(key))
@@ -276,7 +274,7 @@ def _along_tracks(task: Task, motion: Motion, starts: Events, reports: Reports |
     begins[motion.moves.indices] = False
     step = points - np.maximum.accumulate(np.where(begins, points, 0))
 
-    def steps_of(codes: npt.NDArray[np.int64]) -> IndexArray:
+    def steps_of(codes: Indices) -> IndexArray:
         return np.asarray(step[codes // starts.keys.num_keys % len(points)])
 
     order = np.argsort(steps_of(starts.codes), kind="stable")

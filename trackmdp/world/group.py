@@ -8,13 +8,12 @@ from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.config.several import MOST_TARGETS
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, grid_words
-from trackmdp.world.model import Array, Task, World
+from trackmdp.world.model import Array, Indices, Task, World
 from trackmdp.world.tracks import Problem, Recorded, modelled
 
 
@@ -103,7 +102,7 @@ class Group(Carded):
         return self.recorded or self.kinds[0]
 
     @cached_property
-    def kind(self) -> npt.NDArray[np.int64]:
+    def kind(self) -> Indices:
         """`[K]`, place of each target's motion in `kinds`."""
         place = {id(world): number for number, world in enumerate(self.kinds)}
         return np.array([place[id(world)] for world in self.worlds])

@@ -11,18 +11,17 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.world.entries import ones_at
 from trackmdp.world.files import read_matrix
 from trackmdp.world.kernel_checks import canonical_kernel
-from trackmdp.world.model import Array, BoolArray, Size, grid_size
+from trackmdp.world.model import Array, BoolArray, Indices, Size, grid_size
 from trackmdp.world.rows import merged, pairwise_row_sums
 
 Border: TypeAlias = Literal["renormalize", "inside", "clip", "exit"]
 
-_Offsets: TypeAlias = npt.NDArray[np.int64]
+_Offsets: TypeAlias = Indices
 
 _CELLS_AT_ONCE = 2**15
 """Rows made together: rejected draws stay small beside the kernel."""
@@ -140,14 +139,14 @@ def _one_low(count: int, low: float, exit_probability: float) -> Array:
     return np.array([low] + [rest] * (count - 1))
 
 
-def _in_grid(grid: tuple[int, int], cells: npt.NDArray[np.int64], offsets: _Offsets) -> BoolArray:
+def _in_grid(grid: tuple[int, int], cells: Indices, offsets: _Offsets) -> BoolArray:
     position = np.stack(np.divmod(cells, grid[1]), axis=-1) + offsets
     return np.all((position >= 0) & (position < grid), axis=-1)
 
 
 def _place(
     grid: tuple[int, int],
-    cells: npt.NDArray[np.int64],
+    cells: Indices,
     offsets: _Offsets,
     weights: Array,
     totals: Array,
@@ -185,7 +184,7 @@ def _homogeneous(
     """The kernel with `weights` `[K]` in every row, at the offsets `window` `[K, 2]`."""
     grid, scaled = grid_size(size), weights * (1.0 - exit_probability)
 
-    def rows(cells: npt.NDArray[np.int64]) -> sparse.csr_array:
+    def rows(cells: Indices) -> sparse.csr_array:
         offsets = np.broadcast_to(window, (len(cells), *window.shape))
         same = np.broadcast_to(scaled, (len(cells), len(window)))
         return _place(grid, cells, offsets, same, np.full(len(cells), scaled.sum()), border)

@@ -33,6 +33,10 @@ from trackmdp.world.rows import pairwise_row_sums
 
 Array: TypeAlias = npt.NDArray[np.float64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
+Indices: TypeAlias = npt.NDArray[np.int64]
+IndexArray: TypeAlias = npt.NDArray[np.integer[Any]]
+"""Of whole numbers of any width."""
+AnyArray: TypeAlias = npt.NDArray[Any]
 
 Size: TypeAlias = int | Sequence[int]
 """Size of a grid as a user gives it: one number for a square, or rows and columns."""
@@ -234,7 +238,7 @@ class Task(Carded):
         """Whether the safe action always locates the target."""
         return bool((self.safe_detection == 1.0).all())
 
-    def detects(self, cells: npt.NDArray[Any]) -> Array | float:
+    def detects(self, cells: AnyArray) -> Array | float:
         """`[E]` p_d of `cells` `[E]`; simply 1.0 where no sensor misses, so that perfect sensors cost no look-up."""
         return 1.0 if self.perfect else self.detection[cells]
 
@@ -257,9 +261,7 @@ class Task(Carded):
         """`[S]` prices for a planner: where there is no sensor so high that none is ever worth it."""
         return np.where(self.available, self.cost, NEVER)
 
-    def choosable(
-        self, start: npt.NDArray[Any] | None, sensors: npt.NDArray[Any]
-    ) -> BoolArray | None:
+    def choosable(self, start: AnyArray | None, sensors: AnyArray) -> BoolArray | None:
         """`[E]`, whether `sensors` `[E]` exist and can be chosen, the target last located in `start` `[E]`.
 
         Without `start` the window is left out of account. None: all can.

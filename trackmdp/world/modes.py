@@ -22,7 +22,6 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from scipy.special import ndtr
 
@@ -30,7 +29,7 @@ from trackmdp.config.options import GROUPS
 from trackmdp.config.registry import make
 from trackmdp.world.displacements import cell_at
 from trackmdp.world.kernel_checks import canonical_kernel, check_kernel
-from trackmdp.world.model import Array, Size, grid_size
+from trackmdp.world.model import Array, Indices, Size, grid_size
 
 _HEADINGS = np.array([(0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1), (1, 0), (1, 1)])
 """Rows and columns of a step; 0 is to the right, and each of the eight turns left by 45 degrees."""
@@ -39,9 +38,9 @@ _HEADINGS = np.array([(0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1), (1, 
 def turning_back(
     size: Size,
     switch: sparse.csr_array | Array,
-    offsets: npt.NDArray[np.int64],
+    offsets: Indices,
     shares: Array,
-    opposite: npt.NDArray[np.int64],
+    opposite: Indices,
     exit_probability: float,
 ) -> sparse.csr_array:
     """A target that changes its mode, then takes one of the steps of the new mode; at the border it turns back.
@@ -227,7 +226,7 @@ def dithered(mean: Array, deviation: float, reach: int) -> Array:
     return np.where(chance < 1e-12, 0.0, chance)  # rounding
 
 
-def steps_of(displacement: Array) -> tuple[npt.NDArray[np.int64], Array]:
+def steps_of(displacement: Array) -> tuple[Indices, Array]:
     """`[H, 4, 2]` whole rows and columns, and `[H, 4]` their probabilities, of mean `displacement` `[H, 2]` cells."""
     low = np.floor(displacement)
     part = displacement - low

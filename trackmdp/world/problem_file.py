@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.errors import UserError
@@ -29,7 +28,7 @@ from trackmdp.untrusted import LARGE, decoded, load_npz, opened
 from trackmdp.world.coverage import Coverage
 from trackmdp.world.files import csr_of, npz_bytes
 from trackmdp.world.group import Group, Subject, group_of, one_target
-from trackmdp.world.model import World
+from trackmdp.world.model import AnyArray, IndexArray, Indices, World
 from trackmdp.world.place import Place, place_arrays, place_in
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 
@@ -38,11 +37,10 @@ PROBLEM = "problem.npz"
 _KINDS = {kind.__name__: kind for kind in (World, Recorded)}
 _TRACKS = {field.name for field in fields(Tracks)}
 
-Arrays: TypeAlias = dict[str, npt.NDArray[Any]]
-Classes: TypeAlias = npt.NDArray[np.integer[Any]]
+Arrays: TypeAlias = dict[str, AnyArray]
 
 
-def problem_arrays(problem: Subject, classes: Classes | None = None) -> Arrays:
+def problem_arrays(problem: Subject, classes: IndexArray | None = None) -> Arrays:
     """The arrays of `problem.npz`.
 
     Args:
@@ -58,12 +56,12 @@ def problem_arrays(problem: Subject, classes: Classes | None = None) -> Arrays:
     return as_arrays({"kind": type(problem).__name__, **given, "classes": classes})
 
 
-def problem_bytes(problem: Subject, classes: Classes | None = None) -> bytes:
+def problem_bytes(problem: Subject, classes: IndexArray | None = None) -> bytes:
     """The content of `problem.npz`; the same problem gives the same bytes. Arguments as of `problem_arrays`."""
     return npz_bytes(problem_arrays(problem, classes))
 
 
-def problem_digest(problem: Subject, classes: Classes | None = None) -> str:
+def problem_digest(problem: Subject, classes: IndexArray | None = None) -> str:
     """SHA-256 of all arrays of a problem, independent of their compression. Arguments as of `problem_arrays`."""
     digest = hashlib.sha256()
     for name, array in problem_arrays(problem, classes).items():
@@ -101,7 +99,7 @@ def subject_in(stream: BinaryIO) -> Subject:
     return group_of(problem, len(members)) if kind == "Group" else problem
 
 
-def _group(given: dict[str, Any], members: npt.NDArray[np.int64]) -> Group:
+def _group(given: dict[str, Any], members: Indices) -> Group:
     """The group of the arguments of its first world, with the `kernel` of all kinds and the kind of each target."""
     kernel = given.pop("kernel")
     cells, kinds = math.prod(given["size"]), len(np.unique(members))
@@ -143,7 +141,7 @@ def _parts(value: Any) -> Mapping[str, Any] | None:
     return value if isinstance(value, Mapping) else None
 
 
-def from_arrays(arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
+def from_arrays(arrays: Mapping[str, AnyArray]) -> dict[str, Any]:
     """The arguments that `as_arrays` made arrays of.
 
     Raises:

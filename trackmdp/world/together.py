@@ -14,8 +14,8 @@ from functools import cached_property
 
 import numpy as np
 
-from trackmdp.world.model import BoolArray
-from trackmdp.world.tracks import Indices, Tracks
+from trackmdp.world.model import BoolArray, Indices
+from trackmdp.world.tracks import Tracks
 
 
 class Together:

@@ -9,17 +9,23 @@ from pathlib import Path
 from typing import TypeAlias, Unpack
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Facts
 from trackmdp.seeding import derive
 from trackmdp.world.files import once, read_columns
-from trackmdp.world.model import Array, BoolArray, Size, Task, TaskOptions, World, grid_size
+from trackmdp.world.model import (
+    Array,
+    BoolArray,
+    Indices,
+    Size,
+    Task,
+    TaskOptions,
+    World,
+    grid_size,
+)
 from trackmdp.world.motion import Motion
-
-Indices: TypeAlias = npt.NDArray[np.int64]
 
 _COLUMNS = ({"track", "cell"}, {"track", "row", "column"})
 _FORMAT = "track, cell (or row, column) and, if wanted, step"

@@ -6,11 +6,11 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.errors import UserError
-from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.solvers.linear import per_row
 from trackmdp.world.displacements import displacement
 from trackmdp.world.entries import row_index, with_data
 from trackmdp.world.files import read_numbers
-from trackmdp.world.model import BoolArray
+from trackmdp.world.model import BoolArray, IndexArray
 
 DEVIATIONS = 4.0
 """Standard deviations by which a test of homogeneity has to be exceeded for a group of cells to be split up."""

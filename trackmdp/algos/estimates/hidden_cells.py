@@ -20,10 +20,9 @@ from trackmdp.algos.estimates.second_order import (
     headings,
     shift,
 )
-from trackmdp.solvers.linear import IndexArray
 from trackmdp.world.displacements import cell_at
 from trackmdp.world.entries import among
-from trackmdp.world.model import Array, BoolArray, Task
+from trackmdp.world.model import Array, BoolArray, IndexArray, Task
 from trackmdp.world.tracks import Tracks
 
 _SWEEPS = 20

@@ -16,10 +16,10 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.policies.table import SetTable
-from trackmdp.solvers.linear import IndexArray, triangular
+from trackmdp.solvers.linear import triangular
 from trackmdp.solvers.renewal import Act, Renewal
 from trackmdp.solvers.walk import all_events
-from trackmdp.world.model import Array, BoolArray, Task
+from trackmdp.world.model import Array, BoolArray, IndexArray, Task
 from trackmdp.world.tracks import Tracks
 
 

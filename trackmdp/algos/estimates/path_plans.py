@@ -18,12 +18,12 @@ from trackmdp.algos.estimates.path_gains import AlongPaths, Paths, thinned
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers.exchange import exchange
-from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.solvers.linear import per_row
 from trackmdp.solvers.plans import Layout, Plans, Turn
 from trackmdp.solvers.search import candidates_of, columns_of
 from trackmdp.solvers.sensing import sensing
 from trackmdp.world.entries import ones_at, row_index
-from trackmdp.world.model import Array, Task
+from trackmdp.world.model import Array, IndexArray, Task
 from trackmdp.world.tracks import Tracks, shuffled
 
 PRIORS = (1.0, 3.0, 10.0, 30.0, 100.0)

@@ -10,10 +10,9 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.algos.estimates.shrinkage import without
-from trackmdp.solvers.linear import IndexArray
 from trackmdp.world.displacements import displacement
 from trackmdp.world.entries import ones_at, row_index
-from trackmdp.world.model import Task, World
+from trackmdp.world.model import IndexArray, Task, World
 from trackmdp.world.tracks import Tracks
 
 WEIGHT = 3.0

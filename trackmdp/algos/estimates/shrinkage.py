@@ -25,9 +25,9 @@ import numpy as np
 from scipy import sparse
 from scipy.special import betaln
 
-from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.solvers.linear import per_row
 from trackmdp.world.entries import row_index, with_data
-from trackmdp.world.model import Array, Task, World
+from trackmdp.world.model import Array, IndexArray, Task, World
 
 PRECISIONS = (30.0, 300.0, 3000.0)
 """a + b of the Beta(a, b) of the mixture: broad and narrow groups of probabilities."""
