@@ -285,5 +285,4 @@ def _recordings(line: Array, seen: BoolArray, first: IndexArray) -> IndexArray:
         runs.append(np.column_stack([run[whole], np.full(len(whole), distance)]))
     number = np.unique(np.concatenate(runs), axis=0, return_inverse=True)[1].ravel()
     pairs = ones_at(np.concatenate(paths), count + number, (count + len(number),) * 2)
-    names: IndexArray = connected_components(pairs, directed=False)[1][:count].astype(np.int64)
-    return names
+    return connected_components(pairs, directed=False)[1][:count].astype(np.int64)

@@ -97,8 +97,7 @@ def from_hydra(cfg: DictConfig, root: type[_C], folder: Path) -> _C:
     Raises:
         UserError: an unknown key (also one added with `+`), a missing value, a wrong type, or a broken rule.
     """
-    checked: _C = config_of(composed_values(cfg, root), root, folder)
-    return checked
+    return config_of(composed_values(cfg, root), root, folder)
 
 
 def composed_values(cfg: DictConfig, schema: type[Any]) -> dict[str, Any]:

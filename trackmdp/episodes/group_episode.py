@@ -81,5 +81,4 @@ class GroupEpisode(Recording):
         since = np.maximum.accumulate(np.append(0, np.where(late, np.arange(len(late)) + 1, 0)))
         step = np.arange(len(late) + 1)[:, None] - 1 - np.arange(t_max + 1)
         kept = step >= since[:, None]
-        found: BoolArray = self.action[np.where(kept, step, 0)] & kept[..., None]
-        return found
+        return self.action[np.where(kept, step, 0)] & kept[..., None]

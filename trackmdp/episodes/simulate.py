@@ -96,8 +96,7 @@ def simulate(
         tried = first(_TRIED)
         each = _COPIES * tried.nbytes / _TRIED + _SEED
         check_free(f"simulate: episodes={episodes}", episodes * each)
-    made: Episodes | GroupEpisodes = first(episodes)
-    return made
+    return first(episodes)
 
 
 _MANY, _TRIED = 2**16, 64

@@ -25,8 +25,7 @@ class BeliefFilter:
 
     def cells(self, belief: Array) -> Array:
         """`[B, M]` probability of each cell."""
-        found: Array = belief.reshape(len(belief), -1, self._modes).sum(axis=2)
-        return found
+        return belief.reshape(len(belief), -1, self._modes).sum(axis=2)
 
     def detect(
         self, cell: Indices, mode: Indices | None = None, predicted: Array | float = 1.0

@@ -47,8 +47,7 @@ class OnnxTable:
         names = (each.name for each in self._session.get_inputs())
         state = {name: np.array([it]) for name, it in zip(names, (key, misses), strict=True)}
         (action,) = self._session.run(["action"], state)
-        found: list[int] = np.flatnonzero(action[0]).tolist()
-        return found
+        return np.flatnonzero(action[0]).tolist()
 
 
 def _task(about: dict[str, str], sensors: int) -> Task:

@@ -307,8 +307,7 @@ class PolicyTable(Carded, SetTable):
         """The sensors with a probability above 0, n misses after the detection that left `key`."""
         if self.sets is None:
             return list(range(self.task.total_sensors)) if self.probability else []
-        found: list[int] = self.sets.indices[self._entries_of(key, misses)].tolist()
-        return found
+        return self.sets.indices[self._entries_of(key, misses)].tolist()
 
     def chances(self, key: int, misses: int) -> Array:
         """The probabilities of `sensors`."""

@@ -220,8 +220,7 @@ def _all_on(world: World) -> _Choices:
 def _reports_worth(world: World, table: Array, n: int) -> Array:
     """`[E]` worth of a report over a miss after each possible move, n misses before it."""
     over_miss = world.reward + table[:, 0] - table[:, n + 1]
-    worth: Array = world.kernel.data * over_miss[world.kernel.indices]
-    return worth
+    return world.kernel.data * over_miss[world.kernel.indices]
 
 
 def _improved(world: World, table: Array, choices: _Choices, *, exact: bool) -> _Choices:

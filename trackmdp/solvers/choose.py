@@ -89,8 +89,7 @@ class Decisions(ABC):
 
 def priced(decisions: Decisions, task: Task, inside: Array) -> Array:
     """`[G, C]` expected prices: a sensor is paid with the probability `inside` `[K, C]` of the target in the grid."""
-    price: Array = task.prices[decisions.sensors, None] * inside[decisions.rows]
-    return price
+    return task.prices[decisions.sensors, None] * inside[decisions.rows]
 
 
 def largest(rows: IndexArray, net: Array, count: int) -> BoolArray:

@@ -129,8 +129,7 @@ class Shared(Decisions):
 
     def gained(self, gain: Array) -> Array:
         """See `Decisions`."""
-        found: Array = self.sees @ gain
-        return found
+        return self.sees @ gain
 
     def worth(self, on: BoolArray, gain: Array, price: Array) -> Array:
         """`[K, C]` net gain of the sets `on`; each entry's gain is shared by the sensors that may report it."""

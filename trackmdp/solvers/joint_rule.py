@@ -76,8 +76,7 @@ class JointRule(Rule):
         state = TensorDict(rows, len(cell)).to(self._device)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             action = self.actor(state)["action"].cpu().numpy()
-        chosen: BoolArray = action & self.task.available
-        return chosen
+        return action & self.task.available
 
     def tracker(self, cells: Sequence[int]) -> GroupTracker:
         """A tracker that follows targets located in `cells`, one for each."""

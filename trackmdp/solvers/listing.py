@@ -171,8 +171,7 @@ def _small_sets(places: Sequence[IndexArray], budget: int) -> tuple[int, _Bits] 
     turns = np.cumprod([1, *counts])
 
     def bits(t: int, number: IndexArray) -> IndexArray:
-        found: IndexArray = tables[t][number // turns[t] % counts[t]] >> places[t]
-        return found
+        return tables[t][number // turns[t] % counts[t]] >> places[t]
 
     return math.prod(counts), bits
 

@@ -53,8 +53,7 @@ class Clocks:
 
     def late(self, t_max: int) -> BoolArray:
         """`[E]`, whether the safe action is due."""
-        found: BoolArray = np.any(self.present & (self.misses > t_max), axis=1)
-        return found
+        return np.any(self.present & (self.misses > t_max), axis=1)
 
     def remembered(self, on: IndexArray, late: BoolArray) -> BoolArray | None:
         """The history after a step with the sensors `on`, sorted numbers e · S + j; none after a safe action."""

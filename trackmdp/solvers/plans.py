@@ -126,8 +126,7 @@ class Plans:
     def worth(self, sets: Sequence[BoolArray]) -> Array:
         """`[K, C]`, expected reward of whole plans."""
         start = self.undetected(1, sets[0], self.after(sets)[0])
-        found: Array = self.layout.sums(0) @ (self.mass * start)
-        return found
+        return self.layout.sums(0) @ (self.mass * start)
 
     def missing(self, t: int, on: BoolArray, mass: Array) -> Array:
         """`[E, C]`, the part of `mass` at step t that the set `on` leaves undetected."""
@@ -143,8 +142,7 @@ class Plans:
     def priced(self, t: int, mass: Array) -> Array:
         """`[G, C]`, expected price of each decision of step t, `mass` `[E, C]` being undetected before it."""
         turn = self.turns[t - 1]
-        price: Array = turn.price[:, None] * (self.layout.sums(t) @ mass)[turn.choice.rows]
-        return price
+        return turn.price[:, None] * (self.layout.sums(t) @ mass)[turn.choice.rows]
 
     def ascend(
         self,

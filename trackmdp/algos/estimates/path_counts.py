@@ -393,8 +393,7 @@ class _Shared:
         # Each row of the lift once: most cells are never seen, and all those have the last one.
         row, place = np.unique(self.row[start], return_inverse=True)
         gains = self.common[known, local] * self.lift[np.ix_(row, local)]
-        found: Array = (gains * self.scale[row, known][:, None])[place]
-        return found
+        return (gains * self.scale[row, known][:, None])[place]
 
 
 def _mean(gains: Array, arrived: Array, strength: float, above: Array) -> Array:
