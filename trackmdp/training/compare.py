@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from functools import partial
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -137,10 +138,8 @@ def compare(problem: Subject, policies: Mapping[str, Any] | Sequence[Any]) -> Co
     if len(named) < 2:
         raise UserError(f"compare: {len(named)} policies, expected at least two")
     if isinstance(problem, Group):
-        return _of_group(
-            problem, {name: _rule(problem, name, each) for name, each in named.items()}
-        )
-    tables = {name: _table(problem, name, policy) for name, policy in named.items()}
+        return _of_group(problem, _made(problem, named, partial(group_rule, problem)))
+    tables = _made(problem, named, partial(_table, problem))
     if problem.recorded is not None:
         return _on_tracks(problem.recorded, tables)
     rows: list[Compared] = []
@@ -187,19 +186,21 @@ def _of_group(group: Group, rules: Mapping[str, Rule]) -> Comparison:
     return Comparison(rows, None if exact else len(first.totals), units)
 
 
-def _rule(group: Group, name: str, policy: Any) -> Rule:
-    """The policy for several targets."""
-    try:
-        return group_rule(group, _planned(group, policy))
-    except UserError as error:
-        raise UserError(f"compare: {name}: {error}") from error
+M = TypeVar("M")
 
 
-def _planned(problem: Subject, policy: Any) -> Any:
-    """The policy; in place of the name of Q_MDP, which needs a motion model, that of the tracks' estimated kernel."""
-    if policy == "qmdp" and problem.recorded is not None:
-        return estimated_qmdp(problem.recorded)
-    return policy
+def _made(problem: Subject, policies: Mapping[str, Any], make: Callable[[Any], M]) -> dict[str, M]:
+    """What `make` makes of the policies, by their names."""
+    found = {}
+    for name, policy in policies.items():
+        try:
+            # Q_MDP needs a motion model; on recorded tracks it has the kernel estimated from them.
+            if policy == "qmdp" and problem.recorded is not None:
+                policy = estimated_qmdp(problem.recorded)
+            found[name] = make(policy)
+        except UserError as error:
+            raise UserError(f"compare: {name}: {error}") from error
+    return found
 
 
 def _exact(value: float) -> MeanInterval:
@@ -214,11 +215,7 @@ def _named(policies: Sequence[Any]) -> dict[str, Any]:
     }
 
 
-def _table(problem: Problem, name: str, policy: Any) -> Policy:
+def _table(problem: Problem, policy: Any) -> Policy:
     """The policy as a table."""
-    try:
-        policy = _planned(problem, policy)
-        named = isinstance(policy, str)
-        return named_policy(problem, policy) if named else as_policy(problem.task, policy)
-    except UserError as error:
-        raise UserError(f"compare: {name}: {error}") from error
+    named = isinstance(policy, str)
+    return named_policy(problem, policy) if named else as_policy(problem.task, policy)
