@@ -110,7 +110,7 @@ class HindsightLoss(nn.Module):
         actor_loss.allocate((task.num_keys, choices, self.sensors.width), device)
         self.actor_loss = actor_loss
         self.discount = discount
-        entries = max(self.sensors.entries, self.near.width * self._classes)
+        entries = max(self.sensors.entries, self.near.width * self._keys.modes)
         self._keys_at_once = max(1, max_entries // (choices * entries))
         self._keep_prices()
         self.clocks = nn.Buffer(torch.arange(choices, device=device).unsqueeze(-1))
@@ -259,8 +259,8 @@ class HindsightLoss(nn.Module):
             The clocked actor's losses summed per clock, `[T+1]`, and the clocked critic's targets `[rows, T+2]`.
         """
         nearby, logits = self._of_keys(self.near.cells, rows), self.clocked_actor(rows)
-        k, h = nearby.shape[1], self._classes
-        ends = self._keys_of(nearby)
+        k, h = nearby.shape[1], self._keys.modes
+        ends = self._ends(nearby, rows)
         moved, visits = self._counted(moves, rows, len(nearby))
         stays = moved.sum(-1)
         # advantage[:, ends] is [T + 1, x, C H]: transposed to the layout [x, T + 1, C H].
@@ -292,22 +292,25 @@ class HindsightLoss(nn.Module):
         loss = decision_loss(logits, plus, minus, stays.unsqueeze(-1) * cost)
         return loss.sum((0, 2)), target
 
-    def _keys_of(self, cells: Tensor) -> Tensor:
-        """`[x, C H]`, the keys in `cells` `[x, C]`; M outside the grid."""
-        h = self._classes
-        keys = cells.unsqueeze(-1) * h + torch.arange(h, device=cells.device)
-        return keys.flatten(1).clamp_max(self._keys.num_keys)
+    def _ends(self, cells: Tensor, rows: slice) -> Tensor:
+        """`[x, C H]`, the keys after moves from the keys `rows` to `cells` `[x, C]`, in H modes; M outside."""
+        keys, device = self._keys, cells.device
+        start = torch.arange(keys.num_keys, device=device)[rows, None, None]
+        modes = torch.arange(keys.modes, device=device)
+        ends: Tensor = keys.next(start, 0, cells.unsqueeze(-1), modes)
+        return ends.flatten(1).clamp_max(keys.num_keys)
 
     def _counted(self, moves: Tensor, rows: slice, count: int) -> tuple[Tensor, Tensor]:
         """`[x, 1, C H]`, the moves from each of `count` keys by their end, and `[x, 1]` all, exits included.
 
         Their quotient is the empirical kernel P_xj.
         """
-        k, h, m = self.near.width, self._classes, self._keys.num_keys
+        k, h, m = self.near.width, self._keys.modes, self._keys.num_keys
         (start, end), first = moves, rows.start or 0
+        near = self.near.index(self._keys.cell(start), self._keys.cell(end))
         # Flat place in [rows, C H] of a move: with C = 9, H = 1, from cell 7 to its local cell 5 is 7 * 9 + 5 = 68;
         # where the slice begins at cell 4, 68 - 36 = 32. Exits have weight 0, wherever `index` puts them.
-        place = (start * k + self.near.index(start // h, end // h) - first * k) * h + end % h
+        place = (start * k + near - first * k) * h + end % h
         moved = scatter_add((end < m).float(), place, count * k * h).view(count, 1, k * h)
         return moved, torch.bincount(start - first, minlength=count).unsqueeze(-1)
 
