@@ -47,9 +47,9 @@ def on_tracks(task: Recorded, iterations: int = 2, prior: str = "0") -> ModelBas
     return ModelBased(task.task, cfg, iterations=iterations, seed=0, device=CPU)  # type: ignore[arg-type]
 
 
-def swept(count: int = 20, **more: object) -> Recorded:
-    tracks = by_hand(*[[SWEEP[number % 6] for number in range(13)]] * count, exits=True)
-    return recorded(tracks, markov=False, **more)
+def swept(count: int = 20, lengths: tuple[int, ...] = (13,), **more: object) -> Recorded:
+    tracks = [[SWEEP[number % 6] for number in range(length)] for length in lengths * count]
+    return recorded(by_hand(*tracks, exits=True), markov=False, **more)
 
 
 @pytest.fixture
@@ -182,10 +182,12 @@ def test_negligible_moves_are_planned_without_and_leave_the_exit_as_it_is() -> N
 
 @pytest.mark.parametrize("prior", ["0", "null"])
 def test_it_learns_the_zigzag_from_recordings(prior: str) -> None:
-    task = swept(memory="displacement", clip=1)
+    # Recordings that end in different cells, so that some can judge.
+    task = swept(lengths=(12, 13, 14, 15, 16, 17), memory="displacement", clip=1)
     learner = on_tracks(task, iterations=1, prior=prior)
-    figures = learner.step(collect(task, learner.policy, 20, 20))
-    assert replay(task, task.tracks, learner.actor).totals[:, 0] == pytest.approx(12 * 0.8)
+    figures = learner.step(collect(task, learner.policy, 20, 60))
+    moves = task.tracks.lengths - 1
+    assert replay(task, task.tracks, learner.actor).totals[:, 0] == pytest.approx(moves * 0.8)
     assert figures["keys_seen"] > 7
 
 

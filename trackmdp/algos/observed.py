@@ -27,6 +27,8 @@ from trackmdp.world.windows import Window
 
 _ENDING = 8
 """Cells at the end of a path that identify its recording: wherever a path began, it ends as its recording."""
+_FACTOR = 0x9E3779B97F4A7C15
+"""Odd, so that it has an inverse modulo 2^64."""
 _LONGEST_WAIT = 16
 """Misses of the safe action up to which the cells in between are inferred."""
 EM_ROUNDS = 20
@@ -208,7 +210,7 @@ class SensedPaths:
         ends = ends_of(np.bincount(track[inside], minlength=len(exits)))
         line, seen = line[inside], seen[inside]
         names = _recordings(line, seen, ends).astype(np.int64)
-        return Tracks(line, ends, exits, names)
+        return Tracks(line, ends, exits, names).select(~_goes_on(line, ends, exits))
 
     def _filled(self, paths: ObservedPaths, line: Indices, first: Indices) -> IndexArray:
         """The cells of whole paths that begin at places `first`, those that are -1 drawn."""
@@ -265,6 +267,24 @@ def _missed(paths: ObservedPaths) -> Missed:
         return 1.0 - np.asarray(sensed[row.ravel(), cells.ravel()]).reshape(cells.shape)
 
     return missed
+
+
+def _goes_on(line: IndexArray, first: IndexArray, exits: BoolArray) -> BoolArray:
+    """`[K]`, paths that stop in the grid where another one, the same up to there, goes on.
+
+    Of a recording that was followed to its end they show nothing new. As paths that differ they would count as more
+    recordings than there are, and to judge a plan by them is to judge it by what it was learned from.
+    """
+    # A number for each path up to each place, a polynomial modulo 2^64: different paths hardly ever share one.
+    powers, inverses = (
+        np.cumprod(np.full(len(line), factor, dtype=np.uint64))
+        for factor in (_FACTOR, pow(_FACTOR, -1, 2**64))
+    )
+    sums = np.cumsum((line + 1).astype(np.uint64) * powers)
+    start = np.repeat(first[:-1], np.diff(first))
+    code = (sums - np.append(np.uint64(0), sums)[start]) * inverses[start]
+    last = first[1:] - 1
+    return ~exits & np.isin(code[last], np.delete(code, last))
 
 
 def _recordings(line: Array, seen: BoolArray, first: IndexArray) -> IndexArray:
