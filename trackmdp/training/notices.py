@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from trackmdp.config import TrainConfig
 from trackmdp.world.group import Subject
+from trackmdp.world.model import Task
 
-FAR = 0.05
-"""Regret per step, in rewards of a detection, from which a policy counts as poor."""
+FAR, _NEAR = 0.05, 0.01
+"""Regret per step, in rewards of a detection, from which a policy counts as poor; of credit per sensor where more than
+the cell counts."""
+_SINGLE = "credit per sensor may miss sets that only pay together where more than the cell counts"
 
 
 def why_chosen(config: TrainConfig, subject: Subject) -> str | None:
@@ -33,7 +37,7 @@ def poor(
     aihtr: float,
     others: Mapping[str, float],
     regret: float,
-    reward: float,
+    task: Task,
 ) -> list[str]:
     """One line for each sign of a poor policy, with the option that helps.
 
@@ -41,11 +45,12 @@ def poor(
         config: of the run.
         aihtr: of the policy.
         others: AIHTR of simple policies, by their names.
-        regret: per step, to the best policy known; nan where there is none.
-        reward: of a detection, the unit of `FAR`.
+        regret: per step, to the best policy known; nan where none but `others` is.
+        task: that was learned.
     """
     if not others:
         return []
+    single = config.algo.name.endswith("_per_sensor") and (task.keyed or not task.markov)
     found, name = [], max(others, key=lambda each: others[each])
     if others[name] > aihtr + (slack := 1e-6 * max(1.0, abs(aihtr))):
         # A policy of less memory, learned from the same tracks, is named by its option.
@@ -53,8 +58,12 @@ def poor(
         found.append(
             f"warning: {name} earns {others[name]:,.3f}, more than the learned policy; {advice}"
         )
-    elif regret > FAR * reward:
-        found.append(f"warning: {regret:.3f} per step below the best policy known; {_help(config)}")
+    elif regret > (_NEAR if single else FAR) * task.reward:
+        why = f" ({_SINGLE})" if single else ""
+        said = f"warning: {regret:.3f} per step below the best policy known{why}"
+        found.append(f"{said}; {_help(config)}")
+    elif single and math.isnan(regret):
+        found.append(f"note: {_SINGLE}; compare with algo=model_based")
     nothing = others.get("no sensors")
     if nothing is not None and nothing >= max(aihtr, *others.values()) - slack:
         found.append("note: no policy known earns more than no sensors at all; see cost.sensor")

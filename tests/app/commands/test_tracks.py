@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.config.cases import composed
-from tests.helpers import small_world
+from tests.helpers import headings, small_world
 from tests.reads import record_reads, unread
 from tests.tracks import drawn, write
 from tests.training.runs import assert_same_run, at_iteration
@@ -389,8 +389,36 @@ def test_the_default_price_of_a_search_is_named(capsys: pytest.CaptureFixture[st
 def test_the_advice_for_a_policy_below_one_of_less_memory_is_that_memory() -> None:
     config = compose("train", {"task.memory": "displacement"})
     others = {"task.memory=cell": 2.0, "all on": -9.0}
-    (line,) = poor(config, 1.0, others, float("nan"), 1.0)
+    (line,) = poor(config, 1.0, others, float("nan"), small_world())
     assert line.endswith("more than the learned policy; try task.memory=cell")
+
+
+@pytest.mark.parametrize("algo", ["a2c_per_sensor", "hindsight"])
+@pytest.mark.parametrize("memory", ["cell", "displacement"])
+@pytest.mark.parametrize("hides", [True, False])
+def test_credit_per_sensor_says_why_it_ends_below_the_best(
+    algo: str, memory: str, *, hides: bool
+) -> None:
+    """Of hidden modes, or of a memory: from .01 per step in units of the reward, and where no optimum is known."""
+    config = compose("train", {"algo": algo})
+    task = (headings() if hides else small_world()).but(memory=memory, reward=2.0)
+    single = algo == "a2c_per_sensor" and (hides or memory != "cell")
+    lines = {regret: poor(config, 1.0, {"Q_MDP": 0.5}, regret, task) for regret in (0.019, 0.021)}
+    assert lines[0.019] == []
+    assert len(lines[0.021]) == single
+    for line in [*lines[0.021], *poor(config, 1.0, {"all on": 0.5}, float("nan"), task)]:
+        assert single
+        assert "only pay together" in line
+        assert line.endswith("algo=model_based")
+
+
+def test_credit_per_sensor_of_hidden_modes_ends_with_a_hint(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    few = ["collector.total_frames=2000", "collector.frames_per_batch=1000", "algo.updates=4"]
+    words = ["kernel=heading", "grid.size=3", "cost.sensor=0.01", "algo.hidden=8", *few]
+    assert main(["train", "algo=dqn_per_sensor", *words, "hydra.run.dir=a"]) == 0
+    assert "note: credit per sensor may miss" in capsys.readouterr().out
 
 
 def test_a_policy_below_a_reference_is_named(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -120,6 +121,8 @@ def _show_several(console: Console, cfg: TrainConfig, several: Several) -> None:
 
 def _warn(console: Console, trainer: Learning, run: Run, others: Mapping[str, float]) -> None:
     """Print the signs of a poor policy."""
-    known, reward = run.summary["regret_per_step_lower"], trainer.problem.task.reward
-    for line in notices.poor(trainer.config, run.evaluation.aihtr, others, known, reward):
+    # To no policy but those in `others` where no optimum was solved for.
+    regret = run.summary["regret_per_step_lower"] if run.solution is not None else math.nan
+    task = trainer.problem.task
+    for line in notices.poor(trainer.config, run.evaluation.aihtr, others, regret, task):
         console.print(line)
