@@ -166,7 +166,7 @@ def test_joint_losses_hold_for_all_sets_of_undecided_cells() -> None:
         )
         cells, mass = np.arange(6)[None], rng.random((1, 6))
         joint = Joint(world, detected, [ends, known])
-        after = joint.next(cells, np.ones((1, 6), dtype=bool))
+        after = joint.next(cells, mass, np.ones((1, 6), dtype=bool))
         assert after is not None
 
         def lost(left: np.ndarray) -> float:
@@ -176,9 +176,7 @@ def test_joint_losses_hold_for_all_sets_of_undecided_cells() -> None:
 
         for decided in (2, 3, 6):
             left = np.arange(6) < decided - (decided == 3)
-            own, added = joint.losses(
-                after, cells, mass, 1, np.zeros(1, dtype=int), left[None], decided
-            )
+            own, added = joint.losses(after, 1, np.zeros(1, dtype=int), left[None], decided)
             np.testing.assert_allclose(own[0], lost(left))
             for others in itertools.product([False, True], repeat=6 - decided):
                 chosen = left | np.array([False] * decided + list(others))

@@ -90,8 +90,8 @@ def check_choice(group: str, name: Any) -> None:
     raise refuse(group, name, f"one of {', '.join(GROUPS[group])}")
 
 
-def validate(cfg: Any, place: str = "", root: Any = None) -> None:
-    """Refuse the first option that is missing, is out of range or breaks a rule.
+def validate(cfg: _T, place: str = "", root: Any = None) -> _T:
+    """The config; the first option that is missing, is out of range or breaks a rule is refused.
 
     Args:
         cfg: the config of a command, or a part of one.
@@ -109,6 +109,7 @@ def validate(cfg: Any, place: str = "", root: Any = None) -> None:
     # Rules between options may count on every single value; the rule of a node comes after those around it.
     for key, node in nodes(cfg, place):
         node.check(key, root or cfg)
+    return cfg
 
 
 def refuse_ignored(cfg: Any, typed: Mapping[str, Any]) -> None:

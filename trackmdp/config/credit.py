@@ -36,9 +36,7 @@ class PerSensorConfig(EveryTaskConfig):
         "all sensors on; or mixed with the policy learned so far, which costs less and shows less",
         choices=("all_on", "mixed"),
     )
-    explore: ScheduleConfig = nested(
-        "with collect=mixed, share of the steps in which all sensors are on"
-    )
+    explore: ScheduleConfig = nested("with collect=mixed, share of the steps with all sensors on")
     gamma: float = option(
         "discount inside the credit; policies are evaluated undiscounted", ge=0, lt=1
     )
@@ -87,10 +85,8 @@ class PerSensorConfig(EveryTaskConfig):
     def check(self, key: str, root: Any) -> None:
         """`explore` is a probability."""
         for end in ("start", "end"):
-            if (probability := getattr(self.explore, end)) > 1:
-                raise refuse(
-                    f"{key}.explore.{end}", probability, "a number from 0 to 1, a probability"
-                )
+            if (share := getattr(self.explore, end)) > 1:
+                raise refuse(f"{key}.explore.{end}", share, "a number from 0 to 1, a probability")
 
     def ignored(self, root: Any) -> dict[str, str]:
         """All sensors on leave nothing to explore."""
@@ -103,9 +99,8 @@ class PerSensorConfig(EveryTaskConfig):
         marks the ones that go on; paths of t_max + 3 cells, longer ones where a policy remembers detections, are kept
         as well, and the results of exchange on whole paths, for each detection that may be on them.
         """
-        length = (
-            task.t_max + 3 + (0 if task.markov else 2 * (task.order + 2) * (task.t_max + 2) - 2)
-        )
+        longer = 0 if task.markov else 2 * (task.order + 2) * (task.t_max + 2) - 2
+        length = task.t_max + 3 + longer
         moves = min(self.buffer_size, root.collector.total_frames)
         whole, events = self.exchange * (task.t_max + 2) * 12, (task.t_max + 3) ** task.order
         cells, numbers = (

@@ -17,6 +17,7 @@ from trackmdp.errors import UserError
 from trackmdp.untrusted import parse_yaml, read_text
 
 _C = TypeVar("_C", bound=CommandConfig)
+_T = TypeVar("_T")
 
 
 def to_dict(cfg: Any) -> dict[str, Any]:
@@ -70,7 +71,7 @@ def load_config(file: Path, root: type[_C]) -> _C:
     """
     plain = parse_yaml(read_text(file), str(file))
     try:
-        return _checked(plain, root)
+        return validate(build_config(plain, root))
     except UserError as error:
         raise UserError(f"{file}: {error}") from error
 
@@ -81,7 +82,7 @@ def train_config_of(text: str | bytes) -> TrainConfig:
     Raises:
         UserError: there is none.
     """
-    return _checked(parse_yaml(text, "config.yaml"), TrainConfig)
+    return validate(build_config(parse_yaml(text, "config.yaml"), TrainConfig))
 
 
 def load_run_config(folder: str | Path) -> TrainConfig:
@@ -100,13 +101,7 @@ def load_run_config(folder: str | Path) -> TrainConfig:
     return config
 
 
-def _checked(plain: Mapping[str, Any], root: type[_C]) -> _C:
-    typed: _C = build_config(plain, root)
-    validate(typed)
-    return typed
-
-
-def build_config(plain: Any, schema: type[Any], prefix: str = "") -> Any:
+def build_config(plain: Any, schema: type[_T], prefix: str = "") -> _T:
     """The dataclasses of a plain config; values are not checked.
 
     Args:

@@ -14,7 +14,7 @@ from trackmdp.episodes.episode_draws import Columns, Draws, joined, uniform
 from trackmdp.episodes.group_episode import GroupEpisode
 from trackmdp.solvers.merging import Beliefs, Clocks, Rule, followed
 from trackmdp.world.group_paths import GroupPaths, group_paths
-from trackmdp.world.model import BoolArray, IndexArray
+from trackmdp.world.model import IndexArray
 from trackmdp.world.outcomes import Costs
 
 AT_ONCE = 4096
@@ -47,11 +47,10 @@ class _Batch:
         self._rule, self._group, self._paths = rule, rule.group, paths
         self._task, self._costs, self._seeds = rule.task, Costs(rule.task), seeds
         self._shape = len(seeds), len(rule.group)
-        targets = len(rule.group)
         # As with one target, moves and reports apart, so that two policies with one seed meet the same targets.
         self._moves, self._seen = Draws(seeds, self._move_draws), None
         if not (rule.task.perfect and rule.task.safe):
-            self._seen = uniform(seeds, "report", targets)
+            self._seen = uniform(seeds, "report", self._shape[1])
         self._taken: list[Columns] = []
         self._kept: list[Beliefs] | None = [] if beliefs else None
 
@@ -99,27 +98,22 @@ class _Batch:
             draw = np.ones(self._shape)
             draw[row] = self._seen.at(torch.from_numpy(row), step).numpy()
             seen &= draw < np.where(late[:, None], task.safe_detection[cell], task.detection[cell])
-        reward = self._reward(action, seen, late, present)
+        under_way = present.any(axis=1)
+        spent = self._costs.price_of(torch.from_numpy(action))
+        spent = torch.where(torch.from_numpy(late), task.safe_cost, spent)
+        earned = task.reward * torch.from_numpy(seen).sum(-1)
+        reward = (earned - spent * torch.from_numpy(under_way)).float().numpy()
         columns = {"misses": clocks.misses, "action": np.packbits(action, axis=1), "reward": reward}
         # A target that enters is located; it has no part in this step's reward.
         seen |= inside & ~clocks.present
         columns |= {"target": np.where(inside, cell, cells), "located": seen}
-        columns["truncated"] = present.any(axis=1)
+        columns["truncated"] = under_way
         self._taken.append({name: column[row] for name, column in columns.items()} | {"row": row})
         if self._kept is not None:
             self._kept.append(moved)
         inside &= ~paths.ended(place).numpy()[:, None]
         reports = inside, seen & inside
         return place, *followed(self._group, clocks, moved, on, state, reports)
-
-    def _reward(
-        self, action: BoolArray, seen: BoolArray, late: BoolArray, present: BoolArray
-    ) -> Any:
-        """`[E]` float32."""
-        spent = self._costs.price_of(torch.from_numpy(action))
-        spent = torch.where(torch.from_numpy(late), self._task.safe_cost, spent)
-        spent = spent * torch.from_numpy(present.any(axis=1))
-        return (self._task.reward * torch.from_numpy(seen).sum(-1) - spent).float().numpy()
 
     def _episode(self, number: int, start: IndexArray, columns: dict[str, Any]) -> GroupEpisode:
         count = self._task.total_sensors

@@ -16,8 +16,7 @@ from scipy import sparse
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, decimal, grid_words
 from trackmdp.world.coverage import reported, shared_out
-from trackmdp.world.entries import ones_at, row_index
-from trackmdp.world.kernel_checks import short_indices
+from trackmdp.world.entries import ones_at, row_index, short_indices
 from trackmdp.world.model import AnyArray, Array, BoolArray, Task, window_cells
 
 _AT_ONCE = 2**19

@@ -223,9 +223,10 @@ class Tree:
             picked = choices.pick(some)
             lost[some] = self._joint_loss(picked, picked.left)
             return lost, added
-        at = choices.state[some], choices.left[some]
-        of = frontier.after, frontier.cells, frontier.mass, frontier.sets_left - 1
-        lost[some], added[some] = self._joint.losses(*of, *at, k)
+        of = frontier.after, frontier.sets_left - 1
+        lost[some], added[some] = self._joint.losses(
+            *of, choices.state[some], choices.left[some], k
+        )
         return lost, added
 
     def _joint_loss(self, choices: Choices, left: BoolArray) -> Array:
@@ -371,7 +372,8 @@ class Tree:
         if not self._world.perfect:
             frontier = replace(frontier, missed=(moved - found)[kept])
         present = np.arange(frontier.cells.shape[1]) < frontier.count[:, None]
-        after = self._joint.next(frontier.cells, present) if self._world.perfect else None
+        at = frontier.cells, frontier.mass, present
+        after = self._joint.next(*at) if self._world.perfect else None
         frontier = replace(frontier, rest=self._least_loss(frontier), after=after)
         first = Choices.undecided(frontier, frontier.relaxed - frontier.rest[:, 0])
         if frontier.missed is not None:  # the missed mass has this loss under every choice

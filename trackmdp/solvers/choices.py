@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.solvers.joint import Next
-from trackmdp.world.entries import among, row_index
+from trackmdp.world.entries import among, ranks, row_index
 from trackmdp.world.model import Array, BoolArray, IndexArray
 
 
@@ -66,7 +66,7 @@ class Frontier:
         # a cell without positive regret is sensed in every choice; there is nothing to decide
         entry = entry[np.lexsort((-moved.data[entry], rows[entry]))]
         count = np.bincount(rows[entry], minlength=len(kept))
-        column = np.arange(len(entry)) - np.repeat(np.cumsum(count) - count, count)
+        column = ranks(rows[entry])
         shape = (len(kept), int(count.max(initial=0)))
         cells, mass, loss = np.zeros(shape, dtype=np.intp), np.zeros(shape), np.zeros(shape)
         cells[rows[entry], column] = moved.indices[entry]

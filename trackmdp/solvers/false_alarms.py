@@ -17,6 +17,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation, pooled
 from trackmdp.solvers.linear import RenewalSystem, per_row
 from trackmdp.solvers.walk import Events, Passed, Step, Walk, all_events, passed, transition
+from trackmdp.world.entries import ranks
 from trackmdp.world.model import Array, IndexArray, World
 from trackmdp.world.tracks import Problem, modelled
 
@@ -111,10 +112,10 @@ def _reports(
     """
     m, (pointer, cells) = world.num_cells, ranked
     now, target, believes = mass @ step.moves, step.states, step.rows % m
-    count = np.diff(pointer)[believes]
     # Each entry once for every sensor that is on: with counts 2 0 1, entries 0 0 2 and places 0 1 0 in their sets.
+    count = np.diff(pointer)[believes]
     entry = np.repeat(np.arange(len(now)), count)
-    place = np.arange(len(entry)) - np.repeat(np.cumsum(count) - count, count)
+    place = ranks(entry)
     cell = cells[pointer[believes[entry]] + place]
     # The place of the target's own sensor in the set, beyond its end where that is off.
     own = np.full(len(now), np.iinfo(np.int64).max)

@@ -37,13 +37,17 @@ _WIDEST = 1 << 13
 
 @dataclass(frozen=True)
 class Next:
-    """Where the target may go on to from the cells of B states.
+    """Where the target may go on to from the K cells of each of B states.
 
     Attributes:
+        start: `[B, K]`, these cells.
+        mass: `[B, K]`, with which probability it is there.
         cells: `[B, I]`, the cells that can be reached, padded with M.
         place: `[B, K, Z]`, place among `cells` of each of the Z moves out of each of the K cells of a state.
     """
 
+    start: IndexArray
+    mass: Array
     cells: IndexArray
     place: IndexArray
 
@@ -65,8 +69,8 @@ class Joint:
         self._revealed = [np.append(known, 0.0) for known in revealed]
         self._detected = np.append(detected, 0.0)
 
-    def next(self, cells: IndexArray, present: BoolArray) -> Next | None:
-        """Where the states with `cells` `[B, K]` go on to; None where that is too much to be worth it."""
+    def next(self, cells: IndexArray, mass: Array, present: BoolArray) -> Next | None:
+        """Where states go on to, by their cells `present`; None where that is too much to be worth it."""
         none = len(self._to) - 1
         to = self._to[np.where(present, cells, none)]
         flat = to.reshape(len(to), -1)
@@ -82,24 +86,16 @@ class Joint:
         np.put_along_axis(place, order, rank, axis=1)
         reached = np.full((len(to), width), none)
         np.put_along_axis(reached, rank, ranked, axis=1)
-        return Next(reached.astype(np.int32), place.reshape(to.shape).astype(np.int16))
+        place = place.reshape(to.shape).astype(np.int16)
+        return Next(cells, mass, reached.astype(np.int32), place)
 
     def losses(
-        self,
-        after: Next,
-        cells: IndexArray,
-        mass: Array,
-        sets_left: int,
-        state: IndexArray,
-        left: BoolArray,
-        decided: int,
+        self, after: Next, sets_left: int, state: IndexArray, left: BoolArray, decided: int
     ) -> tuple[Array, Array]:
         """Loss of the cells left, and the least addition of each undecided cell if it were left as well.
 
         Args:
             after: of the states.
-            cells: `[B, K]`, where each state's target may be.
-            mass: `[B, K]`, with which probability.
             sets_left: sets after the one that is decided on, at least 1.
             state: `[P]`, of each choice.
             left: `[P, K]`, the cells left unsensed.
@@ -114,22 +110,14 @@ class Joint:
         for first in range(0, len(state), size):
             part = slice(first, first + size)
             known, where = np.unique(state[part], return_inverse=True)
-            chosen = Next(after.cells[known], after.place[known])
-            lost[part], added[part] = self._part(
-                chosen, cells[known], mass[known], sets_left, where, left[part], decided
-            )
+            chosen = Next(*(each[known] for each in vars(after).values()))
+            lost[part], added[part] = self._part(chosen, sets_left, where, left[part], decided)
         return lost, added
 
     def _part(
-        self,
-        after: Next,
-        cells: IndexArray,
-        mass: Array,
-        sets_left: int,
-        where: IndexArray,
-        left: BoolArray,
-        decided: int,
+        self, after: Next, sets_left: int, where: IndexArray, left: BoolArray, decided: int
     ) -> tuple[Array, Array]:
+        cells, mass = after.start, after.mass
         ends, known = self._revealed[sets_left - 1], self._revealed[sets_left]
         to, place = self._to[cells], after.place.astype(np.intp)
         moved = mass[:, :, None] * self._p[cells]

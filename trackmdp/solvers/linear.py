@@ -18,8 +18,7 @@ from scipy.linalg.lapack import dgetrf, dgetrs
 from scipy.sparse.linalg import splu, spsolve_triangular
 
 from trackmdp.errors import UserError
-from trackmdp.world.entries import summing
-from trackmdp.world.kernel_checks import short_indices
+from trackmdp.world.entries import short_indices, summing
 from trackmdp.world.model import Array, IndexArray, World
 
 DIRECT_CELLS = 20_000

@@ -22,6 +22,17 @@ def with_data(matrix: sparse.csr_array, data: npt.NDArray[Any]) -> sparse.csr_ar
     return sparse.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
 
 
+def short_indices(matrix: sparse.csr_array) -> sparse.csr_array:
+    """The same matrix with int32 indices, where they are enough: half the memory, and products read half as much.
+
+    SciPy takes the widest integer among a matrix's parts, so that one array of int64 spreads to all.
+    """
+    if max(*matrix.shape, matrix.nnz) > np.iinfo(np.int32).max:
+        return matrix
+    pointers = (each.astype(np.int32, copy=False) for each in (matrix.indices, matrix.indptr))
+    return sparse.csr_array((matrix.data, *pointers), shape=matrix.shape)
+
+
 def ones_at(
     rows: Numbers, columns: Numbers, shape: tuple[int, int], kind: Any = np.bool_
 ) -> sparse.csr_array:

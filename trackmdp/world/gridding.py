@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from trackmdp.errors import UserError
+from trackmdp.world.entries import ranks
 from trackmdp.world.model import Array
 from trackmdp.world.place import Place, projected, projection
 from trackmdp.world.positions import Positions
@@ -150,16 +151,14 @@ def _sampled(positions: Positions, grid: Gridding) -> tuple[np.ndarray, Array, A
         raise UserError(
             f"kernel.step={grid.step:g}: makes {whole.sum():.3g} steps of it, expected at most {_MOST:,}"
         )
-    count = whole.astype(np.int64)
     # All paths one after the other on one axis of time, for one call of interp. Example: reports at 7 9 | 3 5 8 with a
     # pause of 1 between the paths stand at 0 2 | 3 5 8, and with a step of 2 are sampled at 0 2 | 3 5 7.
     pause = np.concatenate([[0.0], np.cumsum(length + 1.0)[:-1]])
     path = np.repeat(np.arange(len(start)), end - start + 1)
     axis = positions.time - positions.time[start][path] + pause[path]
-    of = np.repeat(np.arange(len(start)), count)
-    number = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+    of = np.repeat(np.arange(len(start)), whole.astype(np.int64))
     # Rounding must not carry the last sample into the pause, where the line leads to another target.
-    wanted = np.minimum(number * grid.step, length[of]) + pause[of]
+    wanted = np.minimum(ranks(of) * grid.step, length[of]) + pause[of]
     x, y = (np.interp(wanted, axis, column) for column in (positions.x, positions.y))
     track = positions.track
     final = np.append(track[1:] != track[:-1], True)[end]

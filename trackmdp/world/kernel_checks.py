@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import breadth_first_order
 
 from trackmdp.config.sensors import LARGEST_PRICE
 from trackmdp.errors import UserError
-from trackmdp.world.entries import ones_at, row_index
+from trackmdp.world.entries import ones_at, row_index, short_indices
 from trackmdp.world.rows import pairwise_row_sums
 
 Range: TypeAlias = tuple[Callable[[npt.NDArray[np.float64]], npt.NDArray[np.bool_]], str]
@@ -49,20 +49,6 @@ def canonical_kernel(kernel: Any, source: str = "kernel") -> sparse.csr_array:
     canonical.sum_duplicates()
     canonical.eliminate_zeros()
     return short_indices(canonical)
-
-
-def short_indices(matrix: sparse.csr_array) -> sparse.csr_array:
-    """The same matrix with int32 indices, where they are enough: half the memory, and products read half as much.
-
-    SciPy takes the widest integer among a matrix's parts, so that one array of int64 spreads to all.
-    """
-    if max(*matrix.shape, matrix.nnz) > np.iinfo(np.int32).max:
-        return matrix
-    pointers = (
-        matrix.indices.astype(np.int32, copy=False),
-        matrix.indptr.astype(np.int32, copy=False),
-    )
-    return sparse.csr_array((matrix.data, *pointers), shape=matrix.shape)
 
 
 def one_each(

@@ -7,7 +7,7 @@ expectation-maximisation, Celeux and Diebolt 1985). What a stop tells of moves t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -82,7 +82,7 @@ class _Moves:
 
     task: Task
     moves: IndexArray
-    counts: dict[str, tuple[IndexArray, Array]]
+    counts: Mapping[str, tuple[IndexArray, IndexArray]]
 
     @classmethod
     def of(cls, task: Task, line: Tracks, unknown: BoolArray) -> _Moves:
@@ -98,9 +98,7 @@ class _Moves:
         at, before, after = at[possible], before[possible], after[possible]
         codes = _codes(task, moves, before, headings(task, line, moves)[at], after)
         counts = {name: np.unique(each, return_counts=True) for name, each in codes.items()}
-        return cls(
-            task, moves, {name: (code, n.astype(float)) for name, (code, n) in counts.items()}
-        )
+        return cls(task, moves, counts)
 
     def candidates(self, last: IndexArray) -> tuple[IndexArray, BoolArray]:
         """`[K, H]` cells that the `moves` lead to from cells `last` `[K]`, and whether they are in the grid."""
@@ -134,9 +132,8 @@ class _Moves:
         """Probability of the next cell."""
         codes = _codes(self.task, self.moves, cell, mode, after)
         count = {name: _looked_up(*self.counts[name], each) for name, each in codes.items()}
-        alone = count["bc"] / np.maximum(count["b"], 1.0)
-        found: Array = (count["bmc"] + WEIGHT * alone) / (count["bm"] + WEIGHT)
-        return found + _LEAP
+        alone: Array = count["bc"] / np.maximum(count["b"], 1.0)
+        return (count["bmc"] + WEIGHT * alone) / (count["bm"] + WEIGHT) + _LEAP
 
 
 def _codes(
@@ -147,7 +144,7 @@ def _codes(
     return {"b": cell, "bc": cell * wide + after, "bm": known, "bmc": known * wide + after}
 
 
-def _looked_up(codes: IndexArray, counts: Array, wanted: IndexArray) -> Array:
+def _looked_up(codes: IndexArray, counts: IndexArray, wanted: IndexArray) -> IndexArray:
     """How often the `wanted` codes were counted."""
     place, known = among(codes, wanted)
     return np.where(known, counts[place], 0)

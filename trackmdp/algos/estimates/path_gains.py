@@ -75,11 +75,10 @@ class Paths:
 
     def acts(self, table: SetTable) -> list[Act]:
         """Reports and prices of a policy, its plans in the order of `keys`."""
-        renewal, task = self.renewal, self.task
-        cell, found = renewal.motion.cell, []
-        for n, step in enumerate(renewal.steps[:-1]):
-            report = table.reports(n, renewal.owner[step.rows], cell[step.states])
-            found.append((report, table.spent(n, task.paid)[renewal.owner]))
+        owner, cell, found = self.renewal.owner, self.renewal.motion.cell, []
+        for n, step in enumerate(self.renewal.steps[:-1]):
+            report = table.reports(n, owner[step.rows], cell[step.states])
+            found.append((report, table.spent(n, self.task.paid)[owner]))
         return found
 
     def follow(self, table: SetTable) -> AlongPaths:
@@ -107,14 +106,10 @@ class Paths:
         return AlongPaths(reward, visits, self._gains(acts, value), value)
 
     def _gains(self, acts: list[Act], value: Array) -> list[Array]:
-        renewal, gains = self.renewal, list[Array]()
-        later: Array | None = None
-        for n in range(len(acts) - 1, -1, -1):
-            step = renewal.steps[n]
+        later, gains = self.renewal.missed(value), list[Array]()
+        for (report, spent), step in reversed(list(zip(acts, self.renewal.steps, strict=False))):
             detected = self.task.reward + value[step.following]
-            later = renewal.missed(value) if later is None else later
             gains.insert(0, detected - later)
-            report, spent = acts[n]
             gross = step.moves @ (report * detected + (1.0 - report) * later)
             later = gross - spent[step.before] * step.stay
         return gains

@@ -134,9 +134,7 @@ def believed_world(task: Task, kernel: sparse.csr_array, least: float) -> World:
     """The task with the motion of a `[M, M + 1]` kernel, the last column its exit, without moves below `least`."""
     # Plans on several moves grow with a power of the number of moves, most of which the prior may have added.
     moves = without(kernel[:, :-1], least)
-    if task.revealed > 1:  # of (cell, mode)
-        return World.of(task, moves, modes=task.revealed, max_steps=None)
-    return World.of(task, moves, max_steps=None)
+    return World.of(task, moves, modes=task.revealed, max_steps=None)
 
 
 def without(moves: sparse.csr_array, least: float) -> sparse.csr_array:
