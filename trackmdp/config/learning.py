@@ -258,7 +258,7 @@ class MultiAsyncConfig(WorkersConfig):
     """In worker processes; a batch comes from the first one that is ready. A resumed run starts new episodes."""
 
 
-@choice("collector", "ray", makes="trackmdp.training.collect:ray")
+@choice("collector", "ray", makes="trackmdp.training.on_ray:ray")
 class RayWorkersConfig(WorkersConfig):
     """In workers of a Ray cluster: for one run with environments that need more cores than a machine has.
 

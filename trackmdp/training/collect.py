@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
 
 from trackmdp.config import TrainConfig
-from trackmdp.config.learning import CollectorConfig, RayWorkersConfig, WorkersConfig
+from trackmdp.config.learning import CollectorConfig, WorkersConfig
 from trackmdp.config.registry import maker
 from trackmdp.errors import RunError, message_of
 from trackmdp.imports import safe_children
@@ -102,7 +102,7 @@ def _in_workers(
     threads = {"num_threads": torch.get_num_threads(), "num_sub_threads": cfg.threads}
     with safe_children():
         try:
-            return kind(_of_workers(_worker_env, env, cfg, done), policy, **threads, **common)
+            return kind(of_workers(_worker_env, env, cfg, done), policy, **threads, **common)
         except (RuntimeError, EOFError, OSError) as error:
             # TorchRL's message has the worker's whole traceback from its second line on.
             reason = message_of(error)
@@ -115,27 +115,10 @@ multi_async = partial(_in_workers, MultiAsyncCollector)
 """Every batch is collected by the worker that has it ready."""
 
 
-def ray(
-    env: MakeEnv,
-    policy: TensorDictModuleBase,
-    cfg: RayWorkersConfig,
-    common: dict[str, Any],
-    done: int,
-) -> BaseCollector:
-    """A collector in the workers of a Ray cluster; arguments as for `single`.
-
-    Raises:
-        UserError: Ray is not installed, or there is no such cluster.
-    """
-    from trackmdp.training import on_ray
-
-    workers = _of_workers(partial(_remote_env, cfg.threads), env, cfg, done)
-    return on_ray.make_ray_collector(workers, policy, cfg, common)
-
-
-def _of_workers(
+def of_workers(
     make: Callable[[MakeEnv, str], TrackEnv], env: MakeEnv, cfg: WorkersConfig, done: int
 ) -> list[Callable[[], TrackEnv]]:
+    """Makes the environments of each worker."""
     # A resumed run's workers have streams of their own (`done`), not the first ones again.
     return [partial(make, env, f"{worker}-{done}") for worker in range(cfg.workers)]
 
@@ -146,15 +129,10 @@ def _worker_env(env: MakeEnv, worker: str) -> TrackEnv:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     end_with_parent()
-    return _own_env(env, worker)
+    return own_env(env, worker)
 
 
-def _remote_env(threads: int, env: MakeEnv, worker: str) -> TrackEnv:
-    torch.set_num_threads(threads)
-    return _own_env(env, worker)
-
-
-def _own_env(env: MakeEnv, worker: str) -> TrackEnv:
+def own_env(env: MakeEnv, worker: str) -> TrackEnv:
     """Built in a worker process: its own stream for the targets, and for the actions sampled there."""
     seed_global(env.keywords["seed"], worker)
     return env(stream=f"world-{worker}")

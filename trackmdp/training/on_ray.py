@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector
@@ -14,25 +16,21 @@ from torchrl.collectors.distributed import RayCollector
 from trackmdp.cluster import joining, ray_options
 from trackmdp.config.learning import RayWorkersConfig
 from trackmdp.errors import message_of, require
+from trackmdp.training.collect import MakeEnv, of_workers, own_env
 from trackmdp.world.env import TrackEnv
 
 _STORE = 2**30
 """Bytes for the batches on their way, of a cluster that is started here."""
 
 
-def make_ray_collector(
-    envs: Sequence[Callable[[], TrackEnv]],
+def ray(
+    env: MakeEnv,
     policy: TensorDictModuleBase,
     cfg: RayWorkersConfig,
     common: dict[str, Any],
+    done: int,
 ) -> BaseCollector:
-    """A collector of batches `[B, time]` with the rows of all workers, one after the other.
-
-    Args:
-        envs: makes the environments of each worker.
-        policy: gets new weights at `update_policy_weights_`.
-        cfg: the cluster, and each worker's share of it.
-        common: the options that every collector has.
+    """A collector of batches `[B, time]` with the rows of all workers, one after the other; arguments as for `single`.
 
     Raises:
         UserError: Ray is not installed, or there is no such cluster.
@@ -43,7 +41,7 @@ def make_ray_collector(
     cores = max(1, round(cfg.workers * cfg.cpus_per_worker))
     with joining("collector.address", cfg.address):
         made = _Collector(
-            list(envs),
+            of_workers(partial(_remote_env, cfg.threads), env, cfg, done),
             policy,
             sync=True,
             ray_init_config=ray_options(cfg.address, cores, _STORE) | {"log_to_driver": False},
@@ -56,6 +54,11 @@ def make_ray_collector(
         )
     made.update_policy_weights_()
     return made
+
+
+def _remote_env(threads: int, env: MakeEnv, worker: str) -> TrackEnv:
+    torch.set_num_threads(threads)
+    return own_env(env, worker)
 
 
 class _Collector(RayCollector):
