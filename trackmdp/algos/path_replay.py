@@ -86,13 +86,11 @@ class Replay:
             begins = found & (begin < 0) & (step >= settling)
             begin, first = torch.where(begins, step, begin), torch.where(begins, key, first)
         later = len(paths) - settling - keys.t_max - 1
-        paths = paths.gather(
-            0, begin.clamp_min(0) + torch.arange(later, device=paths.device).unsqueeze(1)
-        )
+        steps = torch.arange(later, device=paths.device).unsqueeze(1)
+        paths = paths.gather(0, begin.clamp_min(0) + steps)
         kept = (begin >= 0) & (paths[0] <= last)
         paths, first = paths[:, kept], first[kept]
-        misses = torch.arange(keys.t_max + 2, device=paths.device).unsqueeze(1)
-        cells = paths[: keys.t_max + 3]
+        misses, cells = steps[: keys.t_max + 2], paths[: keys.t_max + 3]
         own = torch.cat([first.unsqueeze(0), keys.next(first, misses, keys.cell(cells[1:]))])
         return paths, torch.where(cells <= last, own, last + 1)
 
@@ -141,16 +139,12 @@ class Replay:
         """One move to `cell`: whether the target is located there, and key and misses after it."""
         keys, choices = self._keys, self._reports.shape[1]
         start, last = keys.cell(key), keys.num_keys - 1
-        place = (
-            key * choices + misses.clamp_max(choices - 1)
-        ) * self._view.width + self._view.index(start, cell)
+        row = key * choices + misses.clamp_max(choices - 1)
+        place = row * self._view.width + self._view.index(start, cell)
         chance = gather(self._reports, place) * self._view.contains(start, cell)
         safe = self._safe[cell.clamp_max(self._view.num_cells)]
         found = torch.where(misses >= choices, safe, chance) > draws
         # A target that has left has no key: the value there is discarded.
         after = keys.next(key, misses, cell).clamp_max(last)
-        return (
-            found,
-            torch.where(found, after, key),
-            torch.where(found, 0, (misses + 1).clamp_max(choices)),
-        )
+        misses = torch.where(found, 0, (misses + 1).clamp_max(choices))
+        return found, torch.where(found, after, key), misses
