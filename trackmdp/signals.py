@@ -6,21 +6,17 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 from trackmdp.errors import Preempted
-
-if TYPE_CHECKING:  # a sweep hears signals without loading torch
-    from torchrl.collectors import BaseCollector
 
 HEARD = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 """Signals that ask a run to stop."""
 _ONE = 2.0
 """Seconds in which two count as one: `timeout` and some schedulers signal the process, and then its group once more."""
-
 _AGAIN = 20.0
 """Seconds after which a wait for a dead worker is interrupted once more; TorchRL ends the others within ten."""
 
@@ -93,16 +89,15 @@ def stop(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
 
 
 class Watch(ExitStack):
-    """While entered, the end of a worker process of `collector` interrupts the call that waits for it.
+    """While entered, the end of one of a collector's worker processes interrupts the call that waits for it.
 
     TorchRL looks for dead workers where it waits for a batch, but waits for ever where one should acknowledge new
     weights. Here SIGCHLD interrupts the wait. Outside the main thread, and without workers, nothing is done.
     """
 
-    def __init__(self, collector: BaseCollector) -> None:
+    def __init__(self, processes: Iterable[Any]) -> None:
         super().__init__()
-        # TorchRL keeps them as `procs`; a collector in this process, or on Ray, has none.
-        self._processes: list[Any] = list(getattr(collector, "procs", ()))
+        self._processes = list(processes)
         self._waiting = False
         self._again: threading.Timer | None = None
 
@@ -149,9 +144,7 @@ class Watch(ExitStack):
                 self._again = threading.Timer(_AGAIN, self._interrupt)
                 self._again.daemon = True
                 self._again.start()
-                how = (
-                    f"was killed by {signal.Signals(-code).name}"
-                    if code < 0
-                    else f"ended with status {code}"
-                )
+                how = f"ended with status {code}"
+                if code < 0:
+                    how = f"was killed by {signal.Signals(-code).name}"
                 raise RuntimeError(f"worker {index} {how}")

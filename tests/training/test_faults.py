@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -226,7 +225,7 @@ def test_an_interruption_that_is_swallowed_comes_again(monkeypatch: pytest.Monke
     monkeypatch.setattr(signals, "_AGAIN", 0.05)
     worker = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(60,))
     worker.start()
-    watch: Any = Watch(SimpleNamespace(procs=[worker]))  # type: ignore[arg-type]
+    watch: Any = Watch([worker])
     with (
         watch,
         pytest.raises(RuntimeError, match="worker 0 was killed by SIGKILL"),

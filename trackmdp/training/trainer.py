@@ -102,7 +102,8 @@ class Trainer(Training):
             self._build(opened)
             # Left last, after the callbacks' ends: a second signal must not cut off the saving that the first began.
             self._signals = opened.enter_context(Signals())
-            self._watch = opened.enter_context(Watch(self.collector))
+            # TorchRL keeps its workers as `procs`; a collector in this process, or on Ray, has none.
+            self._watch = opened.enter_context(Watch(getattr(self.collector, "procs", ())))
             for callback in self.callbacks:
                 callback.on_start(self)
                 # Registered one by one: if the third callback cannot start, the first two are still ended, in reverse
