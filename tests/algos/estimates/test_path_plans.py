@@ -147,6 +147,24 @@ def test_the_choice_is_the_one_that_earns_most_where_it_is_judged() -> None:
         )
 
 
+def test_another_plan_that_is_chosen_is_made_of_all_paths_and_left_as_it_is() -> None:
+    """The quarter of the paths that judges goes where the others do not: what is counted would change the plan."""
+    _, judge = parted(by_hand(*[[0, 1]] * 8), 3)
+    ends = [5 if name in judge.names else 1 for name in range(8)]
+    tracks = by_hand(*[[0, end] for end in ends], exits=False)
+    task = recorded(tracks)
+    known = planned(task, parted(tracks, 3)[1], prior=0.0, discount=1.0, rounds=5).policy
+    made: list[int] = []
+
+    def other(paths: Tracks) -> PolicyTable:
+        made.append(len(paths))
+        return known
+
+    found = choose_plan(task, tracks, others=[other], discount=1.0, rounds=5, seed=3)
+    assert np.flatnonzero(found.policy.dense()[0, 0]).tolist() == [5]
+    assert made == [6, 8]
+
+
 def test_some_of_many_paths_have_as_many_events_as_asked_for() -> None:
     tracks = line_walks(2, count=400)
     task = recorded(tracks, memory="displacement", clip=1)

@@ -44,20 +44,20 @@ def test_moves_after_a_cell_and_a_move_are_counted_and_the_pooled_ones_count_as_
 
 
 def test_a_stop_keeps_the_last_move_and_is_known() -> None:
-    """0 1 1 2 and 2 2: no move, right, right and a stop, right; no move, no move and a stop."""
-    line = by_hand([0, 1, 1, 2], [2, 2])
+    """0 1 1 2: no move, right, right and a stop, right; 1 1, and 2 2 after it: no move, no move and a stop."""
+    line = by_hand([0, 1, 1, 2], [1, 1], [2, 2])
     moves = displacements(TASK, *line.steps(3))
-    assert headings(TASK, line, moves).tolist() == [0, 2, 3, 2, 0, 1]
+    assert headings(TASK, line, moves).tolist() == [0, 2, 3, 2, 0, 1, 0, 1]
     assert heading_after(
         TASK, moves, np.array([2, 2]), np.array([1, 1]), np.array([1, 2])
     ).tolist() == [3, 2]
 
 
 def test_displacements_are_those_seen() -> None:
-    """A stop, one cell to the left and to the right; on two rows, up and to the right are two moves."""
+    """A stop, one cell to the left and to the right; on a square, down and to the right are two moves."""
     assert len(displacements(TASK, *TRACKS.steps(3))) == 3
     square = tm.make_world("random_walk", size=3)
-    assert len(displacements(square, np.array([3, 0]), np.array([0, 1]))) == 3
+    assert len(displacements(square, np.array([0, 0]), np.array([3, 1]))) == 3
 
 
 @pytest.mark.slow
