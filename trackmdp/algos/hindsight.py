@@ -5,13 +5,14 @@ on it. Nothing else is read: neither the kernel nor a position that was not sens
 clocked actor and critic only lend credit: the worth of a detection while the actor's own chains are still poor. At the
 end the learned sets change jointly where that pays on paths that did not propose it, which gets past the optima that no
 change of one set improves (`joint_trials.py`; on whole paths, where the next move does not depend on the cell alone,
-`estimates/path_plans.py`).
+`estimates/path_plans.py`, from the sets of either actor).
 """
 
 from __future__ import annotations
 
 import copy
 import math
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -32,6 +33,7 @@ from trackmdp.algos.common import (
 from trackmdp.algos.estimates.alike import cell_classes
 from trackmdp.algos.estimates.path_plans import choose_plan
 from trackmdp.algos.hindsight_loss import HindsightLoss
+from trackmdp.algos.in_view import SensorsInView
 from trackmdp.algos.joint_trials import tried
 from trackmdp.algos.moves import MoveBuffer
 from trackmdp.algos.path_replay import Replay
@@ -43,13 +45,14 @@ from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import generator
 from trackmdp.world.model import IndexArray, Task
+from trackmdp.world.tracks import Tracks
 from trackmdp.world.windows import Window
 
 _MOST_CELLS_OF_NETS = 4_096
 """Above, embeddings of each (cell, clock) take time and memory that tables do not. At N = 32 tables end .007 per step
 below the optimum where nets end .002 below, and both .002 after the exchange."""
-_DISCOUNT_OF_TRIALS = 0.95
-"""Nets learn faster with less, but what two sets gain together may come several detections later."""
+_LATE_DISCOUNT = 0.95
+"""Of joint changes. Nets learn faster with less, but what two sets gain together may come several detections later."""
 _LONGER = 4
 """As many fewer whole paths per update than paths put together from moves."""
 _LOSSES = ("clocked_actor", "clocked_critic", "actor", "critic")
@@ -169,24 +172,26 @@ class Hindsight:
 
     def _renew_policy(self, learner: _Learner) -> None:
         """Rebuild the evaluated policy, and with `collect=mixed` the collecting one, from the averaged actor."""
-        table = PolicyTable(self.task, self._exchanged(learner.sets(self.task)))
+        table = PolicyTable(self.task, self._exchanged(learner))
         self.actor = as_policy(self._whole_task, lifted(self._whole_task, table))
         if isinstance(self.policy, Exploring):
             self.policy.renew(self.actor)
             self.policy.explore.fill_(self.cfg.explore.at(self._iteration / self._collecting))
 
-    def _exchanged(self, sets: sparse.csr_array) -> sparse.csr_array:
-        """The learned sets after joint changes, at the end."""
+    def _exchanged(self, learner: _Learner) -> sparse.csr_array:
+        """The learned sets; at the end after joint changes."""
+        sets = learner.sets(self.task)
         if not self.cfg.exchange or self._mixed or self._update < self.updates:
             return sets
         if isinstance(self._buffer, MoveBuffer):
             return self._after_trials(self._buffer, sets)
         paths, judge = self._buffer.tracks(), self._buffer.judge
         assert judge is not None
-        learned = PolicyTable(self.task, sets)
-        others = [lambda _: learned]  # no validation path was learned from
+        # No validation path was learned from.
+        starts = [PolicyTable(self.task, each) for each in (sets, learner.clocked_sets(self.task))]
+        others = [partial(_same, each) for each in starts]
         found = choose_plan(
-            self.task, paths, priors=(), others=others, discount=self.cfg.gamma, seed=judge
+            self.task, paths, priors=(), others=others, discount=_LATE_DISCOUNT, seed=judge
         )
         return found.policy.sets
 
@@ -202,7 +207,7 @@ class Hindsight:
         def draw() -> IndexArray:
             return buffer.paths(self.cfg.batch_size, task.t_max + 2, rng).cpu().numpy()
 
-        return tried(task, sets, draw, _DISCOUNT_OF_TRIALS)
+        return tried(task, sets, draw, _LATE_DISCOUNT)
 
     def _make_learner(self, reach: int) -> _Learner:
         loss = HindsightLoss(
@@ -233,6 +238,11 @@ class Hindsight:
         if self._seen is None:
             self._seen = int(_distance(*self._buffer.moves(), self.task).max())
         return self._seen
+
+
+def _same(policy: PolicyTable, _: Tracks) -> PolicyTable:
+    """The policy, whatever the paths."""
+    return policy
 
 
 def _buffer(
@@ -324,12 +334,30 @@ class _Learner(Checkpointed):
 
     def sets(self, task: Task) -> sparse.csr_array:
         """`[keys * (T+1), S]` bool, the policy's table."""
-        sensors = self.loss.sensors.numbers
-        # Entry (key, n, k) is sensor sensors[x, k], x the key's cell, in row key (T+1) + n of the table; `nonzero`
-        # lists them row by row.
-        key, n, local = self._on().nonzero(as_tuple=True)
-        column = sensors[task.keys.cell(key), local]
-        there = torch.as_tensor(np.append(task.available, False), device=column.device)[column]
-        place = ((key * task.num_choices + n)[there].cpu().numpy(), column[there].cpu().numpy())
-        shape = (task.num_keys * task.num_choices, task.total_sensors)
-        return sparse.csr_array((np.ones(len(place[0]), dtype=bool), place), shape=shape)
+        return _rows(task, self.loss.sensors, self._on())
+
+    @torch.no_grad()
+    def clocked_sets(self, task: Task) -> sparse.csr_array:
+        """The same of the clocked actor: the policy if the position were revealed after every action."""
+        loss = self.loss
+        on = torch.cat([loss.clocked_actor(rows) > 0 for rows in loss.slices()])
+        return _rows(task, loss.nearby, on)
+
+
+def _rows(task: Task, sensors: SensorsInView, on: Tensor) -> sparse.csr_array:
+    """`[keys * (T+1), S]` bool, from `on` `[keys, T+1, K]` of the sensors in view."""
+    # Entry (key, n, k) is sensor numbers[x, k], x the key's cell, in row key (T+1) + n of the table; `nonzero` lists
+    # them row by row.
+    key, n, local = on.nonzero(as_tuple=True)
+    cell = task.keys.cell(key)
+    row, cell, column = (
+        each.cpu().numpy()
+        for each in (key * task.num_choices + n, cell, sensors.numbers[cell, local])
+    )
+    there = np.flatnonzero(column < task.total_sensors)
+    possible = task.choosable(cell[there], column[there])
+    there = there if possible is None else there[np.asarray(possible).ravel()]
+    shape = (task.num_keys * task.num_choices, task.total_sensors)
+    return sparse.csr_array(
+        (np.ones(len(there), dtype=bool), (row[there], column[there])), shape=shape
+    )

@@ -37,8 +37,7 @@ _ROUNDS, _LEAST_SHARE, _RISE = 30, 1 / 64, 1e-5
 _SEARCHED = 2
 """The best plans, which exchange begins from."""
 TRIED, _MOST = 200_000, 600_000
-"""Events on which plans are tried, and on which the best are searched: few, as a round takes a second for a million.
-The last search, on all paths, is only one, and takes twice as many."""
+"""Events on which plans are tried, and on which the best are searched: few, as a round takes a second for a million."""
 _JUDGED = 0.25
 """Share of the recordings that judge, where no others are there for it."""
 
@@ -88,7 +87,7 @@ def choose_plan(
     if counted is tracks:
         return _valued(paths, plans[best].on(paths.keys))
     stage, place = best // len(order), order[best % len(order)]
-    whole = Paths(task, thinned(task, tracks, 2 * _MOST, seed), discount)
+    whole = Paths(task, thinned(task, tracks, _MOST, seed), discount)
     if stage == 0 and place >= len(priors):  # as it was made
         return _valued(whole, KeyPlans.of_table(others[place - len(priors)](tracks), whole.keys))
     last = _improved(whole, weights[place], rounds, plans[best])  # from the plan that was chosen
