@@ -275,7 +275,8 @@ def test_what_depends_on_more_than_the_cell_is_learned_from_whole_paths_only() -
     """The target goes 3, 4, 5, 4, 3, 4 ...: two steps after 3 it is in 5, as moves alone do not tell.
 
     Sensing 4 costs nearly as much as it earns. Whole paths say: in 5 leave 4 out and wait, .4 in two steps; and in 3
-    wait as well, or sense 4 for .1 and then, certain after 3, 5 for .4: .9 in four steps in all.
+    wait as well, or sense 4 for .1 and then, certain after 3, 5 for .4: .9 in four steps in all. Or the same with 3 and
+    5 the other way round.
     Put together from moves, 5 is as likely as 3, and at .5 neither is worth .6: what is left is 4, at .1 a step.
     """
     rng = np.random.default_rng(0)
@@ -302,6 +303,7 @@ def test_what_depends_on_more_than_the_cell_is_learned_from_whole_paths_only() -
             replay(setting, tracks, policy).intervals(tracks.names)["reward_per_step"].mean
         )
         if not markov:
-            assert policy.dense()[5].nonzero()[0].tolist() == [1]
+            waits = [(policy.dense()[end].nonzero()[0] == [1]).all() for end in (3, 5)]
+            assert any(waits)
     assert earned[False] > 0.21
     assert earned[True] < 0.11
