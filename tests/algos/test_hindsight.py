@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -52,6 +54,12 @@ def test_learns_once_the_frames_are_in() -> None:
 def test_updates_grow_with_the_rows(words: tuple[str, ...], t_max: int, expected: int) -> None:
     cfg = train_config("algo=hindsight", *words).algo
     assert budget(Task(10, cost=0.1, t_max=t_max), cfg)[0] == expected
+
+
+def test_keys_of_three_detections_take_fewer_updates_and_smaller_nets() -> None:
+    cfg, task = train_config("algo=hindsight").algo, Task(3, cost=0.1, t_max=1, markov=False)
+    assert budget(replace(task, memory="displacement_gap"), cfg) == (800, 256)
+    assert budget(replace(task, memory="two_displacements"), cfg) == (500, 64)
 
 
 def test_a_target_that_goes_farther_than_the_nets_see_is_gone() -> None:

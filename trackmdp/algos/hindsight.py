@@ -62,6 +62,8 @@ def budget(task: Task, cfg: PerSensorConfig) -> tuple[int, int]:
     """Updates and hidden units: as configured, else by the number of rows (x, n) that the actor has to get right."""
     few = task.num_keys * task.num_choices <= 300
     hidden = 128 if few else 256 if task.num_keys <= _MOST_CELLS_OF_NETS else 0
+    # Of keys of three detections few occur, and paths are long: more ended no better, in twice the time.
+    few, hidden = (True, min(hidden, 64)) if task.order > 1 else (few, hidden)
     updates = cfg.updates or round(cfg.effort * (500 if few else 800))
     return updates, hidden if cfg.hidden is None else cfg.hidden
 
