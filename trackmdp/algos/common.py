@@ -17,7 +17,7 @@ from trackmdp.config import TrainConfig
 from trackmdp.config.registry import maker
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.world.model import AnyArray, Task
+from trackmdp.world.model import AnyArray, IndexArray, Task
 
 
 class Algorithm(Protocol):
@@ -131,6 +131,16 @@ def lifted(task: Task, table: PolicyTable) -> PolicyTable:
     rows = known[:, None] * task.num_choices + np.arange(task.num_choices)
     assert table.sets is not None
     return PolicyTable(task, table.sets[rows.ravel()])
+
+
+def choosable_places(task: Task, located: IndexArray, sensors: IndexArray) -> IndexArray:
+    """`[C]`, places of those among `sensors` `[E]` that exist and can be chosen after a detection in `located` `[E]`.
+
+    Numbers from S on stand for no sensor.
+    """
+    there = np.flatnonzero(sensors < task.total_sensors)
+    possible = task.choosable(located[there], sensors[there])
+    return there if possible is None else there[np.asarray(possible).ravel()]
 
 
 def tensors(arrays: Mapping[str, Any]) -> dict[str, Tensor]:

@@ -25,6 +25,7 @@ from trackmdp.algos.actor_loss import ActorLoss, Decision
 from trackmdp.algos.common import (
     Averages,
     Checkpointed,
+    choosable_places,
     known_alone,
     lifted,
     located,
@@ -44,6 +45,7 @@ from trackmdp.policies.acting import Exploring
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import generator
+from trackmdp.world.entries import ones_at
 from trackmdp.world.model import IndexArray, Task
 from trackmdp.world.tracks import Tracks
 from trackmdp.world.windows import Window
@@ -61,9 +63,13 @@ _LOSSES = ("clocked_actor", "clocked_critic", "actor", "critic")
 def budget(task: Task, cfg: PerSensorConfig) -> tuple[int, int]:
     """Updates and hidden units: as configured, else by the number of rows (x, n) that the actor has to get right."""
     few = task.num_keys * task.num_choices <= 300
-    hidden = 128 if few else 256 if task.num_keys <= _MOST_CELLS_OF_NETS else 0
-    # Of keys of three detections few occur, and paths are long: more ended no better, in twice the time.
-    few, hidden = (True, min(hidden, 64)) if task.order > 1 else (few, hidden)
+    hidden = 128 if few else 256
+    if (
+        task.order > 1
+    ):  # few such keys occur, and paths are long: more ended no better, in twice the time
+        few, hidden = True, 64
+    if task.num_keys > _MOST_CELLS_OF_NETS:
+        hidden = 0
     updates = cfg.updates or round(cfg.effort * (500 if few else 800))
     return updates, hidden if cfg.hidden is None else cfg.hidden
 
@@ -356,10 +362,6 @@ def _rows(task: Task, sensors: SensorsInView, on: Tensor) -> sparse.csr_array:
         each.cpu().numpy()
         for each in (key * task.num_choices + n, cell, sensors.numbers[cell, local])
     )
-    there = np.flatnonzero(column < task.total_sensors)
-    possible = task.choosable(cell[there], column[there])
-    there = there if possible is None else there[np.asarray(possible).ravel()]
+    there = choosable_places(task, cell, column)
     shape = (task.num_keys * task.num_choices, task.total_sensors)
-    return sparse.csr_array(
-        (np.ones(len(there), dtype=bool), (row[there], column[there])), shape=shape
-    )
+    return ones_at(row[there], column[there], shape)

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from trackmdp.algos.common import arrays, tensors
+from trackmdp.algos.common import arrays, choosable_places, tensors
 from trackmdp.algos.estimates.censored import ObservedPaths, hidden_cells
 from trackmdp.algos.estimates.hidden_cells import Missed, redrawn
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
@@ -62,9 +62,7 @@ def observed_paths(batch: TensorDictBase, task: Task, *, last: bool = False) -> 
         sensor = Window.of(task, sensor.device).around(cell[missed])[path, sensor]
     row, sensor = (part.cpu().numpy() for part in (missed[path] * task.num_choices + miss, sensor))
     located = cell.cpu().numpy()[row // task.num_choices]
-    there = np.flatnonzero(sensor < task.total_sensors)
-    possible = task.choosable(located[there], sensor[there])
-    there = there if possible is None else there[np.asarray(possible).ravel()]
+    there = choosable_places(task, located, sensor)
     shape = (len(misses) * task.num_choices, task.total_sensors)
     sets = ones_at(row[there], sensor[there], shape, np.float64)
     report = reported(sets, task.sees_by_cell.T.tocsr())

@@ -92,11 +92,8 @@ class Paths:
         factors = [np.full(renewal.count, self._discount ** -(n + 1)) for n in range(len(steps))]
         factors[-1][renewal.count - renewal.events.forced :] = factors[0][0]
         plain = sum(
-            (
-                sparse.diags_array(factor) @ step.located
-                for step, factor in zip(steps[1:], factors[1:], strict=True)
-            ),
-            factors[0][0] * steps[0].located,
+            sparse.diags_array(factor) @ step.located
+            for step, factor in zip(steps, factors, strict=True)
         )
         visits = triangular(plain, self._starts, self._order, transposed=True)
         reward = sum(
