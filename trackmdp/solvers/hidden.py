@@ -26,8 +26,8 @@ from trackmdp.world.model import BoolArray, World
 _STEPS, _SWEEPS = 12, 1
 _MOST_EVENTS, _MOST_STARTS, _LEAST_STARTS = 6_000, 16, 1
 """Events of all searches together, which bounds their time, and how many searches there are at most and at least."""
-_KICKED_EVENTS, _MOST_KICKS, _TAKEN = 12_000, 16, (0.1, 0.2, 0.5)
-"""The same for kicks, and shares of the keys that one changes. On three by three cells they gain up to .0008 a step."""
+_KICKED_EVENTS, _MOST_KICKS, _TAKEN = 16_000, 40, (0.1, 0.2, 0.5)
+"""The same for kicks, and shares of the keys that one changes. On three by three cells they gain up to .001 a step."""
 
 
 def solve(world: World, *, start: PolicyTable | None = None) -> Solution:
