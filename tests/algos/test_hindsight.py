@@ -5,15 +5,28 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy import sparse
 
-from tests.algos.hindsight import SHORT, assert_it_learns, assert_same, batches, learn, policy
+from tests.algos.hindsight import (
+    SHORT,
+    assert_it_learns,
+    assert_same,
+    batches,
+    learn,
+    policy,
+)
 from tests.helpers import algorithm, small_world, train_config
+from trackmdp.algos.estimates.path_counts import KeyPlans, along
+from trackmdp.algos.estimates.path_gains import Paths
+from trackmdp.algos.estimates.path_plans import choose_plan, parted
 from trackmdp.algos.hindsight import _within, budget
 from trackmdp.errors import UserError
+from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
 from trackmdp.world.kernels import random_walk
+from trackmdp.world.make import make_world
 from trackmdp.world.model import Task, World
 
 
@@ -101,6 +114,30 @@ def test_where_the_target_moves_alike_few_frames_are_enough() -> None:
     ]
     assert regrets[1] < 0.5 * regrets[0]
     assert regrets[1] < 0.02
+
+
+def test_joint_changes_begin_from_both_actors() -> None:
+    """On the paths that judge the clocked actor's sets, changed, earn more here than those of the actor."""
+    world = make_world("heading", size=3, memory="displacement")
+    words = ("algo.updates=60", "algo.updates_per_iteration=60", "algo.batch_size=2048")
+    learner = learn(world, batches(world), *words, "algo.hidden=32")
+    found, buffer = PolicyTable(world, learner.actor.sets), learner._buffer
+    _, judge = parted(buffer.tracks(), buffer.judge)
+    judged = Paths(world, judge, 0.95)
+
+    def earned(table: PolicyTable) -> float:
+        return along(judged, KeyPlans.of_table(table, judged.keys)).reward
+
+    def changed(sets: sparse.csr_array) -> PolicyTable:
+        start = [lambda _: PolicyTable(world, sets)]
+        options = {"priors": (), "others": start, "discount": 0.95, "seed": buffer.judge}
+        return choose_plan(world, buffer.tracks(), **options).policy
+
+    nets = learner._learner
+    alone, clocked = (
+        earned(changed(sets)) for sets in (nets.sets(world), nets.clocked_sets(world))
+    )
+    assert alone < clocked == pytest.approx(earned(found), rel=1e-9)
 
 
 def test_tables_learn_as_nets_do() -> None:

@@ -64,9 +64,7 @@ def budget(task: Task, cfg: PerSensorConfig) -> tuple[int, int]:
     """Updates and hidden units: as configured, else by the number of rows (x, n) that the actor has to get right."""
     few = task.num_keys * task.num_choices <= 300
     hidden = 128 if few else 256
-    if (
-        task.order > 1
-    ):  # few such keys occur, and paths are long: more ended no better, in twice the time
+    if task.order > 1:  # few such keys occur, and more ended no better, in twice the time
         few, hidden = True, 64
     if task.num_keys > _MOST_CELLS_OF_NETS:
         hidden = 0
