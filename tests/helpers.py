@@ -13,15 +13,16 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from trackmdp.algos.common import make_algorithm
+from trackmdp.arrays.types import Array
 from trackmdp.config import GROUPS, EvaluateConfig, TrainConfig, options
 from trackmdp.config.compose import compose
 from trackmdp.config.registry import read_values
 from trackmdp.config.world import BORDERS
-from trackmdp.world.dynamics import Dynamics
-from trackmdp.world.env import TrackEnv
-from trackmdp.world.model import Array, World
-from trackmdp.world.modes import heading_kernel
-from trackmdp.world.paths import RESOLUTION, path_sampler
+from trackmdp.environment.dynamics import Dynamics
+from trackmdp.environment.env import TrackEnv
+from trackmdp.environment.paths import RESOLUTION, path_sampler
+from trackmdp.motion.modes import heading_kernel
+from trackmdp.world.model import World
 
 
 def _without_files(group: str) -> list[str]:

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from trackmdp.config.world import MEMORIES
+from trackmdp.grid.place import Place
 from trackmdp.policies.policy import Policy
-from trackmdp.world.model import Task
-from trackmdp.world.place import Place
+from trackmdp.sensing.task import Task
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "scripts" / "examples"

@@ -28,7 +28,7 @@ from tests.documents import (
 )
 from trackmdp.app.cli import main
 from trackmdp.config import GROUPS, ROOTS
-from trackmdp.world.kernels import drift
+from trackmdp.motion.kernels import drift
 
 THEORY = ROOT / "trackmdp" / "theory.md"
 DOCUMENTS = documents()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from trackmdp.world.tracks import Recorded, Tracks
+from trackmdp.recordings.tracks import Recorded, Tracks
 
 
 def by_hand(*tracks: Sequence[int], exits: bool | Sequence[bool] = True) -> Tracks:

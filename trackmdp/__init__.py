@@ -25,12 +25,12 @@ _HOMES = {
     "Episodes": "trackmdp.episodes.batch",
     "Evaluation": "trackmdp.solvers.evaluation",
     "Group": "trackmdp.world.group",
-    "ObservationVector": "trackmdp.world.observation",
+    "ObservationVector": "trackmdp.environment.observation",
     "Policy": "trackmdp.policies.policy",
-    "Recorded": "trackmdp.world.tracks",
+    "Recorded": "trackmdp.recordings.tracks",
     "Run": "trackmdp.training.run",
     "Solution": "trackmdp.solvers.solution",
-    "TrackEnv": "trackmdp.world.env",
+    "TrackEnv": "trackmdp.environment.env",
     "Tracker": "trackmdp.policies.tracker",
     "Tradeoff": "trackmdp.solvers.tradeoff",
     "World": "trackmdp.world.model",
@@ -50,11 +50,14 @@ _HOMES = {
 __all__ = sorted(_HOMES)
 
 if TYPE_CHECKING:  # the same once more, for type checkers and editors; `X as X` marks a public name
+    from trackmdp.environment.env import TrackEnv as TrackEnv
+    from trackmdp.environment.observation import ObservationVector as ObservationVector
     from trackmdp.episodes.batch import Episodes as Episodes
     from trackmdp.episodes.simulate import simulate as simulate
     from trackmdp.policies.export import export as export
     from trackmdp.policies.policy import Policy as Policy
     from trackmdp.policies.tracker import Tracker as Tracker
+    from trackmdp.recordings.tracks import Recorded as Recorded
     from trackmdp.solvers.evaluate import evaluate as evaluate
     from trackmdp.solvers.evaluation import Evaluation as Evaluation
     from trackmdp.solvers.frontier import frontier as frontier
@@ -65,13 +68,10 @@ if TYPE_CHECKING:  # the same once more, for type checkers and editors; `X as X`
     from trackmdp.training.run import Run as Run
     from trackmdp.training.run import load_run as load_run
     from trackmdp.training.train import train as train
-    from trackmdp.world.env import TrackEnv as TrackEnv
     from trackmdp.world.group import Group as Group
     from trackmdp.world.make import load_tracks as load_tracks
     from trackmdp.world.make import make_world as make_world
     from trackmdp.world.model import World as World
-    from trackmdp.world.observation import ObservationVector as ObservationVector
-    from trackmdp.world.tracks import Recorded as Recorded
 
 
 import trackmdp.gym  # noqa: E402, F401 (registers the environment once Gymnasium is imported)

@@ -26,8 +26,8 @@ def _register(registration: ModuleType) -> None:
         # By name: torch is loaded when an environment is made.
         registration.register(
             ID,
-            "trackmdp.world.gym_env:TrackGym",
-            vector_entry_point="trackmdp.world.gym_env:TrackVector",
+            "trackmdp.environment.gym_env:TrackGym",
+            vector_entry_point="trackmdp.environment.gym_env:TrackVector",
         )
 
 

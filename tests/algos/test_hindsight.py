@@ -21,13 +21,14 @@ from trackmdp.algos.estimates.path_gains import Paths
 from trackmdp.algos.estimates.path_plans import choose_plan, parted
 from trackmdp.algos.hindsight import _within, budget
 from trackmdp.errors import UserError
+from trackmdp.motion.kernels import random_walk
 from trackmdp.policies.table import PolicyTable
+from trackmdp.sensing.task import Task
 from trackmdp.solvers import bounds
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
-from trackmdp.world.kernels import random_walk
 from trackmdp.world.make import make_world
-from trackmdp.world.model import Task, World
+from trackmdp.world.model import World
 
 
 @pytest.mark.parametrize("t_max", [0, 2])

@@ -17,8 +17,9 @@ from tests.algos.hindsight import FORMS, total
 from tests.helpers import small_world
 from trackmdp.algos.actor_loss import Decision, decision_loss
 from trackmdp.algos.hindsight_loss import HindsightLoss
-from trackmdp.world.coverage import discs
-from trackmdp.world.model import Task, World
+from trackmdp.sensing.coverage import discs
+from trackmdp.sensing.task import Task
+from trackmdp.world.model import World
 
 
 @given(st.floats(-5, 5), st.floats(0, 3), st.floats(0, 3), st.floats(0.01, 2))

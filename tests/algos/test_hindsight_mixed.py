@@ -10,11 +10,11 @@ import torch
 
 from tests.algos.hindsight import SHORT, SOLVES, assert_same, batches, learn, policy
 from tests.helpers import algorithm, collect, random_state, small_world
+from trackmdp.motion.kernels import random_walk
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
 from trackmdp.training.train import train
-from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import World
 
 MIXED = (

@@ -12,8 +12,8 @@ from torch import Tensor
 from tests.algos.hindsight import FORMS, total
 from tests.helpers import algorithm, small_world
 from trackmdp.algos.hindsight_loss import HindsightLoss
-from trackmdp.world.coverage import discs
-from trackmdp.world.kernels import random_walk
+from trackmdp.motion.kernels import random_walk
+from trackmdp.sensing.coverage import discs
 from trackmdp.world.model import World
 
 ENTRIES = 5 * 3 * 25

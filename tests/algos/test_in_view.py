@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from trackmdp.algos.in_view import SensorsInView
-from trackmdp.world.coverage import discs
-from trackmdp.world.model import Task
-from trackmdp.world.windows import Window
+from trackmdp.sensing.coverage import discs
+from trackmdp.sensing.task import Task
+from trackmdp.sensing.windows import Window
 
 LINE = Task((1, 4), cost=0.1, t_max=0, coverage=[[1, 1, 1, 0], [0, 0, 1, 1]])
 

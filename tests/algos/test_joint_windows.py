@@ -12,12 +12,12 @@ from torch.utils._pytree import tree_leaves
 
 import trackmdp
 from tests.helpers import algorithm, collect, random_state, small_world
+from trackmdp.motion.kernels import random_walk
 from trackmdp.policies.policy import Policy
+from trackmdp.sensing.windows import Window
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
-from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import World
-from trackmdp.world.windows import Window
 
 JOINT = ("a2c", "ppo", "dqn")
 

@@ -21,11 +21,11 @@ from trackmdp.algos.moves import MoveBuffer, report_weights
 from trackmdp.algos.observed import observed_paths
 from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
+from trackmdp.recordings.tracks import Recorded
+from trackmdp.sensing.task import Task
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
-from trackmdp.world.model import Task
-from trackmdp.world.tracks import Recorded
 
 TASK = Task((1, 3), cost=0.1, t_max=0, detection=[1.0, 0.5, 0.25])
 

@@ -19,13 +19,13 @@ from trackmdp.algos.model_based import ModelBased
 from trackmdp.algos.observed import observed_paths
 from trackmdp.app.cli import main
 from trackmdp.policies.policy import Policy
+from trackmdp.recordings.tracks import Recorded
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
 from trackmdp.solvers.value import replay
 from trackmdp.training.run import load_run
 from trackmdp.world.model import World
-from trackmdp.world.tracks import Recorded
 
 CPU = torch.device("cpu")
 TRACKS = ("kernel=tracks", "kernel.path=t.csv", "task.memory=displacement", "task.clip=1")

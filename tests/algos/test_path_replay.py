@@ -7,7 +7,7 @@ import torch
 
 from tests.helpers import headings
 from trackmdp.algos.path_replay import Replay
-from trackmdp.world.windows import Window
+from trackmdp.sensing.windows import Window
 
 DISCOUNT, SAFE = 0.7, -0.4
 

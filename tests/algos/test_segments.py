@@ -16,8 +16,8 @@ from tests.tracks import by_hand, drawn, recorded
 from trackmdp.algos.estimates.path_plans import parted
 from trackmdp.algos.segments import SegmentBuffer, SensedPaths
 from trackmdp.policies.policy import Policy, as_policy
+from trackmdp.recordings.tracks import Tracks
 from trackmdp.solvers.value import replay
-from trackmdp.world.tracks import Tracks
 
 M = 9
 SETTING = recorded(drawn(small_world(exit_probability=0.2).kernel, 300))

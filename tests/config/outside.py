@@ -170,7 +170,7 @@ FILES = {
     """,
     # A memory.
     "outside/misses.py": """
-        from trackmdp.world.memory import Memory
+        from trackmdp.memory.keys import Memory
 
         class Misses(Memory):
             '''The misses between the last two detections, and 0 at the start.'''

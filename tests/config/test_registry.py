@@ -23,10 +23,10 @@ def test_what_a_choice_makes_is_there(group: str, name: str) -> None:
 def test_what_is_not_there_is_one_line() -> None:
     class Absent(ChoiceConfig):
         name = "absent"
-        makes = "trackmdp.world.kernels:no_such_kernel"
+        makes = "trackmdp.motion.kernels:no_such_kernel"
 
     with pytest.raises(
-        UserError, match=r"absent: cannot be made, trackmdp\.world\.kernels:no_such_kernel: module"
+        UserError, match=r"absent: cannot be made, trackmdp\.motion\.kernels:no_such_kernel: module"
     ):
         maker(Absent)
     with pytest.raises(UserError, match="kernel/no_such_kernel: no such config"):

@@ -18,7 +18,7 @@ from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
 from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy
-from trackmdp.world.coverage import discs
+from trackmdp.sensing.coverage import discs
 from trackmdp.world.model import World
 
 WORDS = [

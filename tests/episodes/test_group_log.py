@@ -25,8 +25,8 @@ from trackmdp.episodes.recover import recover
 from trackmdp.episodes.schema import LoggedRun
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
-from trackmdp.solvers.group_tracker import GroupTracker
-from trackmdp.solvers.merging import Rule, make_rule
+from trackmdp.solvers.several.group_tracker import GroupTracker
+from trackmdp.solvers.several.merging import Rule, make_rule
 from trackmdp.solvers.solve import solve
 from trackmdp.world.group import Group
 from trackmdp.world.model import World

@@ -13,15 +13,15 @@ import trackmdp as tm
 from tests.episodes.browser import CHROMIUM, Browser
 from trackmdp import machine
 from trackmdp.app.cli import main
+from trackmdp.environment.render import around
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.episode_page import PAGE_WIDE
 from trackmdp.episodes.extracts import write_page
 from trackmdp.episodes.player import WIDE, frame
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.errors import UserError
+from trackmdp.sensing.task import Task
 from trackmdp.world.make import make_world
-from trackmdp.world.model import Task
-from trackmdp.world.render import around
 
 
 @pytest.mark.parametrize(

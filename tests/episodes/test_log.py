@@ -23,8 +23,8 @@ from trackmdp.episodes.recover import recover
 from trackmdp.episodes.simulate import simulate
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
+from trackmdp.motion.kernels import random_walk
 from trackmdp.policies.policy import Policy
-from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import World
 
 

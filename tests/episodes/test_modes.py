@@ -20,9 +20,9 @@ from trackmdp.episodes.recover import recover
 from trackmdp.episodes.sentences import mode_words
 from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
+from trackmdp.motion.modes import heading_kernel
 from trackmdp.policies.policy import Policy
 from trackmdp.world.model import World
-from trackmdp.world.modes import heading_kernel
 
 WORLD = ["kernel=heading", "grid.size=3", "kernel.exit_probability=0.1", "cost.sensor=0.2"]
 

@@ -16,6 +16,9 @@ from tests.episodes.logs import WORLD, policy, recorded
 from tests.helpers import hop_world, limited, random_kernel, small_world
 from tests.tracks import by_hand
 from tests.tracks import recorded as recorded_tracks
+from trackmdp.environment.dynamics import Dynamics
+from trackmdp.environment.env import TrackEnv
+from trackmdp.environment.paths import path_sampler
 from trackmdp.episodes.episode import Episode, first_difference
 from trackmdp.episodes.simulate import episode_seeds, resimulate, simulate
 from trackmdp.errors import UserError
@@ -24,12 +27,9 @@ from trackmdp.policies.acting import Playback
 from trackmdp.policies.belief import BeliefFilter
 from trackmdp.policies.policy import Policy
 from trackmdp.seeding import derive
-from trackmdp.world.dynamics import Dynamics
-from trackmdp.world.env import TrackEnv
+from trackmdp.sensing.outcomes import Costs
 from trackmdp.world.group import Group
 from trackmdp.world.model import World
-from trackmdp.world.outcomes import Costs
-from trackmdp.world.paths import path_sampler
 
 ACTING = {
     "table": policy(),

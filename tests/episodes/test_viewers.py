@@ -26,8 +26,8 @@ from trackmdp.episodes.layouts import layout
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.schema import SCHEMAS, schemas_of_several
 from trackmdp.episodes.simulate import simulate
+from trackmdp.motion.kernels import random_walk
 from trackmdp.policies.policy import Policy
-from trackmdp.world.kernels import random_walk
 from trackmdp.world.make import make_world
 from trackmdp.world.model import World
 

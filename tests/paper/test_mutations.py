@@ -15,10 +15,11 @@ from trackmdp.paper.check import Check
 from trackmdp.paper.corner import changed, corner, dearer
 from trackmdp.policies.belief import BeliefFilter
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import bounds, estimator, hidden, known, optimal, pomdp, rules
-from trackmdp.solvers.branch import Tree
-from trackmdp.solvers.delayed import Delayed
-from trackmdp.solvers.joint import Joint
+from trackmdp.solvers import bounds, estimator, hidden, optimal, pomdp, rules
+from trackmdp.solvers.certify import known
+from trackmdp.solvers.certify.branch import Tree
+from trackmdp.solvers.certify.delayed import Delayed
+from trackmdp.solvers.certify.joint import Joint
 
 WORLDS = (corner(paper_world(5, 0.16, 1)), dearer(corner(paper_world(5, 0.22, 2))))
 """Four cells each. First sensors are worth their price at once; then misses happen and the clock runs out."""

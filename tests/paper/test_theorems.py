@@ -10,14 +10,15 @@ import pytest
 from hypothesis import given, settings
 
 from tests.solvers.worlds import paper_world, tiny_worlds
+from trackmdp.arrays.types import BoolArray
+from trackmdp.motion.kernels import random_walk
 from trackmdp.paper import proofs, theorems, worlds
 from trackmdp.paper.check import Check, summarize_checks
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, optimal, rules
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.solution import Solution
-from trackmdp.world.kernels import random_walk
-from trackmdp.world.model import BoolArray, World
+from trackmdp.world.model import World
 
 
 @pytest.fixture(autouse=True, scope="module")

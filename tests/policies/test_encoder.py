@@ -11,7 +11,8 @@ from torch.nn.functional import one_hot
 
 from tests.helpers import headings, random_state, small_world
 from trackmdp.policies.nets import RelativeBias, StateEncoder, StateNetwork
-from trackmdp.world.model import Task, World
+from trackmdp.sensing.task import Task
+from trackmdp.world.model import World
 
 
 def features(world: World, cell: Tensor, n: Tensor, history: Tensor) -> Tensor:

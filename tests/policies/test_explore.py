@@ -7,9 +7,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from trackmdp.arrays.types import BoolArray
 from trackmdp.policies.acting import Exploring, RenewedTable
 from trackmdp.policies.policy import Policy
-from trackmdp.world.model import BoolArray, Task
+from trackmdp.sensing.task import Task
 
 
 def test_a_chain_is_looked_up_by_cell_and_misses() -> None:

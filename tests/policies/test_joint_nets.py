@@ -8,9 +8,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 import trackmdp as tm
+from trackmdp.environment.env import TrackEnv
 from trackmdp.policies.joint_nets import OverTargets
 from trackmdp.policies.nets import StateEncoder, make_actor, make_critic, make_qvalue
-from trackmdp.world.env import TrackEnv
 
 GROUP = tm.make_world("random_walk", size=3, targets=3, exit_probability=0.1, t_max=1)
 

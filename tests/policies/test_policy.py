@@ -21,8 +21,9 @@ from trackmdp.policies import lookup, policy
 from trackmdp.policies.forms import STATE_KEYS
 from trackmdp.policies.nets import SubsetDistribution
 from trackmdp.policies.policy import Policy, actor_table, as_policy
+from trackmdp.sensing.task import Task
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.world.model import Task, World
+from trackmdp.world.model import World
 
 WORLD = small_world(t_max=2)
 M, CHOICES = WORLD.num_cells, WORLD.num_choices

@@ -15,13 +15,13 @@ import trackmdp as tm
 from tests.helpers import small_world, train_config
 from trackmdp.app.commands import train
 from trackmdp.errors import UserError
+from trackmdp.grid.place import Place
 from trackmdp.policies import saved
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.saved import load_policy, save_policy
+from trackmdp.sensing.task import Task
 from trackmdp.solvers import rules
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.world.model import Task
-from trackmdp.world.place import Place
 from trackmdp.world.problem_file import read_problem
 
 

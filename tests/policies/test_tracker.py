@@ -20,7 +20,7 @@ from trackmdp.episodes.episode import Episode
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.world.model import World
-from trackmdp.world.tracks import Problem
+from trackmdp.world.problem import Problem
 
 
 def missing(**more: Any) -> World:

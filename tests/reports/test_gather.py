@@ -25,12 +25,12 @@ from trackmdp.reports.finished import MOST_POINTS, averaged_sets, sensed_cells
 from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.page import build
 from trackmdp.reports.results import RESULTS, Results, load_results, save_results
+from trackmdp.sensing.task import Task
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.folders import read_summary, write_summary
 from trackmdp.training.lock import locked
 from trackmdp.world.make import build_world
-from trackmdp.world.model import Task
 
 Change = Callable[[Path], Any]
 

@@ -9,11 +9,11 @@ import pytest
 
 from tests.tracks import by_hand, recorded
 from trackmdp.episodes.simulate import simulate
+from trackmdp.grid.place import Place
 from trackmdp.policies.policy import Policy
+from trackmdp.recordings.tracks import Recorded
 from trackmdp.reports.held_out import recorded_page
 from trackmdp.training.evaluator import HeldOutEvaluator
-from trackmdp.world.place import Place
-from trackmdp.world.tracks import Recorded
 
 
 def page(world: Recorded, cells: tuple[int, ...] = (1,), subject: str = "<mine>, newest.pt") -> str:

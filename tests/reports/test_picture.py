@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 
+from trackmdp.environment.render import PICTURE_LEGEND
 from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.player import draw_picture
 from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy
 from trackmdp.world.model import World
-from trackmdp.world.render import PICTURE_LEGEND
 
 
 def right_mover() -> World:

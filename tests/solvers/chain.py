@@ -15,9 +15,11 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.policies.table import PolicyTable
-from trackmdp.world.model import Array, BoolArray, Task, World
-from trackmdp.world.tracks import Problem
+from trackmdp.sensing.task import Task
+from trackmdp.world.model import World
+from trackmdp.world.problem import Problem
 
 FIGURES = ("aihtr", "accuracy", "sensors_per_step", "safe_per_episode", "expected_length")
 _KEPT = {"cell": 1, "displacement": 2, "displacement_gap": 2, "two_displacements": 3}
@@ -63,7 +65,7 @@ def target_of(problem: Problem) -> Target:
 
 
 def key_of(task: Task, history: History) -> int:
-    """The number of the key, by the rules of `trackmdp.world.memory`."""
+    """The number of the key, by the rules of `trackmdp.memory.keys`."""
     cells, side = history.cells, 2 * task.clip + 1
 
     def number(back: int, clip: int) -> int:

@@ -9,12 +9,13 @@ import pytest
 
 from tests.solvers.worlds import all_plans, best_of_all, paper_world, random_tiny_world
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import bounds, delayed, optimal, search
-from trackmdp.solvers.branch import Tree
+from trackmdp.solvers import bounds, optimal, search
+from trackmdp.solvers.certify import delayed
+from trackmdp.solvers.certify.branch import Tree
+from trackmdp.solvers.certify.inner import InnerProblem
+from trackmdp.solvers.certify.joint import Joint
+from trackmdp.solvers.certify.known import tables
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.inner import InnerProblem
-from trackmdp.solvers.joint import Joint
-from trackmdp.solvers.known import tables
 from trackmdp.solvers.optimal import payment
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.solution import SearchProgress

@@ -13,15 +13,15 @@ import torch
 import trackmdp as tm
 from tests.solvers.worlds import best_of_all, paper_world, random_tiny_world
 from trackmdp.app.cli import main
+from trackmdp.environment.env import TrackEnv
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
+from trackmdp.sensing.choose import largest
 from trackmdp.solvers import rules
-from trackmdp.solvers.choose import largest
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.frontier import frontier
 from trackmdp.solvers.lookahead import solve as looked_ahead
 from trackmdp.solvers.solve import solve
-from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import World
 
 

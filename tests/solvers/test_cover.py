@@ -9,17 +9,18 @@ import pytest
 
 from tests.helpers import random_kernel, small_world
 from tests.solvers.worlds import best_of_all, footprint_world
+from trackmdp.arrays.entries import row_index
+from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
+from trackmdp.recordings.tracks import Tracks
+from trackmdp.sensing.cover import Shared
+from trackmdp.sensing.decisions import sensing
 from trackmdp.solvers import bounds, lookahead, optimal, rules
-from trackmdp.solvers.cover import Shared
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.sensing import sensing
 from trackmdp.solvers.solve import solve
 from trackmdp.solvers.value import replay
-from trackmdp.world.entries import row_index
-from trackmdp.world.model import Array, World
-from trackmdp.world.tracks import Tracks
+from trackmdp.world.model import World
 
 PLANNERS = (rules.clocked_policy, rules.qmdp, rules.fcr, rules.myopic)
 
@@ -76,7 +77,7 @@ def test_of_sensors_that_see_the_same_the_cheapest_counts(monkeypatch: pytest.Mo
     ):
         assert choice.sensors[on > 0].tolist() == [1, 4]
     # 3 sensors see cell 1, 3 cell 2 and 2 cell 3
-    monkeypatch.setattr("trackmdp.solvers.cover._MOST", 7)
+    monkeypatch.setattr("trackmdp.sensing.cover._MOST", 7)
     with pytest.raises(UserError, match=r"coverage: 8 pairs of a cell .* expected at most 7"):
         one_move(world)
 

@@ -9,11 +9,13 @@ import pytest
 from scipy import sparse
 
 from tests.solvers.worlds import paper_world, random_tiny_world
-from trackmdp.solvers import delayed, optimal
-from trackmdp.solvers.choices import LeftOut
-from trackmdp.solvers.delayed import Delayed
+from trackmdp.arrays.types import Array
+from trackmdp.solvers import optimal
+from trackmdp.solvers.certify import delayed
+from trackmdp.solvers.certify.choices import LeftOut
+from trackmdp.solvers.certify.delayed import Delayed
 from trackmdp.solvers.linear import forced_worth
-from trackmdp.world.model import Array, World
+from trackmdp.world.model import World
 
 
 def _best(world: World, mass: Array, sets: int, detected: Array, missed: Array) -> Array:

@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given, settings
 
 from tests.solvers.worlds import paper_world, tiny_worlds
+from trackmdp.arrays.types import BoolArray
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import estimator, optimal, rules
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.world.model import BoolArray, World
+from trackmdp.world.model import World
 
 
 @given(tiny_worlds(most_t_max=2))

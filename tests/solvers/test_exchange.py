@@ -8,15 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.solvers.worlds import best_of_all, tiny_worlds
+from trackmdp.arrays.types import BoolArray
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import exchange, optimal, search
+from trackmdp.solvers.certify.inner import InnerProblem
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.inner import InnerProblem
 from trackmdp.solvers.plans import Plans
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found, candidates_of, columns_of
 from trackmdp.world.make import make_world
-from trackmdp.world.model import BoolArray, World
+from trackmdp.world.model import World
 
 
 def ascended(problem: InnerProblem, sets: list[BoolArray]) -> list[BoolArray]:

@@ -12,6 +12,7 @@ import pytest
 
 from tests.helpers import random_kernel, small_world
 from trackmdp.app.cli import main
+from trackmdp.arrays.types import Array
 from trackmdp.episodes.filtered import _declared, _posterior, simulate_filter
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
@@ -19,7 +20,7 @@ from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.false_alarms import believed
 from trackmdp.world.make import make_world
-from trackmdp.world.model import Array, World
+from trackmdp.world.model import World
 
 
 def test_one_sensor_by_hand() -> None:

@@ -12,11 +12,12 @@ import pytest
 
 import trackmdp as tm
 from tests.solvers.worlds import all_plans
+from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.frontier import FrontierProgress, frontier
 from trackmdp.solvers.tradeoff import Tradeoff
-from trackmdp.world.model import Array, World
+from trackmdp.world.model import World
 
 
 @cache

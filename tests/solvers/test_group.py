@@ -13,17 +13,19 @@ import pytest
 import trackmdp as tm
 from tests.solvers.worlds import random_tiny_world
 from trackmdp.app.cli import main
+from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
-from trackmdp.solvers import group_bounds, group_value
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.group_bounds import equal_shares, upper_bound
-from trackmdp.solvers.group_chain import explored
-from trackmdp.solvers.group_value import evaluate_group
-from trackmdp.solvers.merging import Beliefs, Clocks, make_rule
+from trackmdp.solvers.several import group_bounds as group_bounds
+from trackmdp.solvers.several import group_value as group_value
+from trackmdp.solvers.several.group_bounds import equal_shares, upper_bound
+from trackmdp.solvers.several.group_chain import explored
+from trackmdp.solvers.several.group_value import evaluate_group
+from trackmdp.solvers.several.merging import Beliefs, Clocks, make_rule
 from trackmdp.solvers.solve import solve
 from trackmdp.world.group import Group
-from trackmdp.world.model import Array, IndexArray, World
+from trackmdp.world.model import World
 
 
 def tiny(seed: int, t_max: int = 0, **options: Any) -> World:

@@ -7,15 +7,15 @@ import pytest
 import torch
 
 from tests.helpers import headings
+from trackmdp.environment.env import TrackEnv
+from trackmdp.motion.modes import heading_kernel
 from trackmdp.solvers import bounds, exchange, hidden, optimal, search
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found
 from trackmdp.solvers.solve import solve
-from trackmdp.world.env import TrackEnv
 from trackmdp.world.make import make_world
 from trackmdp.world.model import World
-from trackmdp.world.modes import heading_kernel
 
 
 @pytest.mark.parametrize(

@@ -11,12 +11,12 @@ from scipy import sparse
 import trackmdp as tm
 from tests.helpers import random_kernel
 from trackmdp.errors import UserError
+from trackmdp.motion.kernels import random_walk
 from trackmdp.solvers import linear, renewal, rules, value
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.linear import RenewalSystem, accumulate, expected_steps
 from trackmdp.solvers.optimal import solve
-from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import World
 
 

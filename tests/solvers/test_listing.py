@@ -7,14 +7,15 @@ import pytest
 
 from tests.helpers import headings
 from tests.solvers.worlds import best_of_all, footprint_world
+from trackmdp.arrays.types import Array
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import listing
+from trackmdp.solvers.certify import listing
+from trackmdp.solvers.certify.listing import Listed, best_plans
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.exchange import revealed
 from trackmdp.solvers.linear import forced_worth
-from trackmdp.solvers.listing import Listed, best_plans
 from trackmdp.solvers.renewal import Renewal
-from trackmdp.world.model import Array, World
+from trackmdp.world.model import World
 
 WORLDS = {
     "footprints": footprint_world(1),

@@ -18,15 +18,17 @@ from tests.solvers.worlds import (
     reference_world,
     tiny_worlds,
 )
+from trackmdp.arrays.types import BoolArray
+from trackmdp.motion.kernels import drift, random_walk
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import bounds, delayed, optimal, search
+from trackmdp.solvers import bounds, optimal, search
+from trackmdp.solvers.certify import delayed
+from trackmdp.solvers.certify.inner import InnerProblem
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.inner import InnerProblem
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found, candidates_of, columns_of
 from trackmdp.solvers.solution import SearchProgress
-from trackmdp.world.kernels import drift, random_walk
-from trackmdp.world.model import BoolArray, World
+from trackmdp.world.model import World
 
 
 def assert_optimal(world: World, best: np.ndarray, tolerance: float = 1e-9) -> None:

@@ -30,14 +30,16 @@ from trackmdp.config.world import MEMORIES
 from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.table import PolicyTable
+from trackmdp.recordings.tracks import Recorded
+from trackmdp.sensing.task import Task
 from trackmdp.solvers import bounds
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import candidates_of
 from trackmdp.solvers.solve import solve
 from trackmdp.solvers.value import key_visits, visits_of
-from trackmdp.world.model import Task, World
-from trackmdp.world.tracks import Problem, Recorded
+from trackmdp.world.model import World
+from trackmdp.world.problem import Problem
 
 SIZES = ((1, 3), (3, 1), (2, 2), (1, 4), (2, 3))
 SENSORS = ("own", "footprints", "chances")

@@ -13,9 +13,9 @@ import trackmdp as tm
 from tests.solvers.worlds import best_of_all, tiny_worlds
 from trackmdp.errors import UserError
 from trackmdp.solvers import optimal, regions, rules
+from trackmdp.solvers.certify.inner import InnerProblem
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.exchange import exchange
-from trackmdp.solvers.inner import InnerProblem
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import candidates_of, columns_of
 from trackmdp.solvers.solution import SearchProgress, Solution

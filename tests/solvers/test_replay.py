@@ -12,14 +12,15 @@ from hypothesis import strategies as st
 
 from tests.helpers import limited, small_world
 from tests.tracks import by_hand, drawn, recorded
+from trackmdp.arrays.types import BoolArray
+from trackmdp.environment.env import TrackEnv
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.table import PolicyTable
+from trackmdp.recordings.tracks import Recorded, Tracks
+from trackmdp.sensing.task import Task
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import ReplayedTracks
 from trackmdp.solvers.value import replay
-from trackmdp.world.env import TrackEnv
-from trackmdp.world.model import BoolArray, Task
-from trackmdp.world.tracks import Recorded, Tracks
 
 FIGURES = ("aihtr", "accuracy", "sensors_per_step", "safe_per_episode", "expected_length")
 

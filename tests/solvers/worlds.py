@@ -12,8 +12,9 @@ import numpy as np
 from hypothesis import strategies as st
 
 from tests.solvers.chain import choosable, sees
-from trackmdp.world.kernels import random_support
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.arrays.types import Array, BoolArray
+from trackmdp.motion.kernels import random_support
+from trackmdp.world.model import World
 
 REFERENCES: list[dict[str, Any]] = json.loads(
     (Path(__file__).parents[1] / "data" / "values.json").read_text(encoding="utf-8")

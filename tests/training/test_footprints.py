@@ -10,7 +10,7 @@ import pytest
 import trackmdp as tm
 from tests.helpers import small_world
 from trackmdp.errors import UserError
-from trackmdp.world.coverage import discs
+from trackmdp.sensing.coverage import discs
 from trackmdp.world.model import World
 
 SHORT = {

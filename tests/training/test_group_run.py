@@ -18,18 +18,18 @@ import trackmdp as tm
 from tests.training.runs import assert_same_run, at_iteration, train
 from trackmdp.app.cli import main
 from trackmdp.config import load_run_config
+from trackmdp.environment.env import TrackEnv
 from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.errors import Preempted, UserError
 from trackmdp.seeding import derive
 from trackmdp.solvers.evaluate import evaluate, group_rule
-from trackmdp.solvers.group_tracker import GroupTracker
-from trackmdp.solvers.group_value import evaluate_group
-from trackmdp.solvers.joint_rule import JointRule
-from trackmdp.solvers.merging import make_rule
+from trackmdp.solvers.several.group_tracker import GroupTracker
+from trackmdp.solvers.several.group_value import evaluate_group
+from trackmdp.solvers.several.joint_rule import JointRule
+from trackmdp.solvers.several.merging import make_rule
 from trackmdp.solvers.solve import solve
 from trackmdp.training.group_run import joint_policy
 from trackmdp.training.inputs import problem_of
-from trackmdp.world.env import TrackEnv
 from trackmdp.world.group import Group
 from trackmdp.world.problem_file import problem_digest
 

@@ -22,6 +22,7 @@ from tests.training.runs import tensors
 from tests.training.runs import train as train_run
 from trackmdp.app.sweep.sweep import run_figures
 from trackmdp.policies.policy import Policy
+from trackmdp.recordings.tracks import Recorded, Tracks, read_tracks, split
 from trackmdp.solvers import rules
 from trackmdp.training import checkpoint
 from trackmdp.training.evaluator import (
@@ -35,7 +36,6 @@ from trackmdp.training.evaluator import (
 from trackmdp.training.folders import run_of
 from trackmdp.world.model import World
 from trackmdp.world.problem_file import PROBLEM, read_problem
-from trackmdp.world.tracks import Recorded, Tracks, read_tracks, split
 
 
 def test_the_setting_decides_who_evaluates() -> None:

@@ -16,8 +16,8 @@ from trackmdp.app.cli import main
 from trackmdp.errors import RunError
 from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.world.model import World
+from trackmdp.world.problem import Problem
 from trackmdp.world.problem_file import problem_digest, read_problem
-from trackmdp.world.tracks import Problem
 
 QUICK: dict[str, Any] = {
     "total_frames": 1024,

@@ -18,12 +18,12 @@ from tests.training.runs import rows
 from trackmdp.app.cli import main
 from trackmdp.app.commands import train as command
 from trackmdp.errors import RunError, UserError
+from trackmdp.motion.kernels import drift
 from trackmdp.policies.policy import Policy
 from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.training.evaluator import Score
 from trackmdp.training.run import load_run
 from trackmdp.training.train import train
-from trackmdp.world.kernels import drift
 from trackmdp.world.model import World
 
 QUICK: dict[str, Any] = {

@@ -11,8 +11,9 @@ import pytest
 
 from tests.helpers import hop_world
 from trackmdp.errors import UserError
+from trackmdp.sensing.task import Task
 from trackmdp.world.make import load_tracks, make_world
-from trackmdp.world.model import Task, World
+from trackmdp.world.model import World
 
 
 def test_a_task_knows_nothing_of_the_motion() -> None:

@@ -12,17 +12,17 @@ import pytest
 import trackmdp as tm
 from tests.helpers import small_world
 from tests.tracks import by_hand, recorded
+from trackmdp.arrays.files import npz_bytes
 from trackmdp.errors import UserError
-from trackmdp.world.files import npz_bytes
+from trackmdp.grid.place import Place
 from trackmdp.world.model import World
-from trackmdp.world.place import Place
+from trackmdp.world.problem import Problem
 from trackmdp.world.problem_file import (
     problem_arrays,
     problem_bytes,
     problem_digest,
     read_problem,
 )
-from trackmdp.world.tracks import Problem
 
 PRICES = np.linspace(0.1, 0.3, 9)
 

@@ -13,11 +13,12 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from trackmdp.arrays.types import AnyArray, IndexArray
 from trackmdp.config import TrainConfig
 from trackmdp.config.registry import maker
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.world.model import AnyArray, IndexArray, Task
+from trackmdp.sensing.task import Task
 
 
 class Algorithm(Protocol):

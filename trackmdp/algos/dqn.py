@@ -33,7 +33,7 @@ from trackmdp.policies.few_sensors import greedy
 from trackmdp.policies.forms import STATE_KEYS
 from trackmdp.policies.nets import EpsilonFlip, joint_value, make_qvalue
 from trackmdp.seeding import generator
-from trackmdp.world.model import Task
+from trackmdp.sensing.task import Task
 
 # An item of priority 0 would never be drawn again.
 _SMALLEST = 1e-8

@@ -39,16 +39,17 @@ from trackmdp.algos.joint_trials import tried
 from trackmdp.algos.moves import MoveBuffer
 from trackmdp.algos.path_replay import Replay
 from trackmdp.algos.segments import InferredMoves, SegmentBuffer
+from trackmdp.arrays.entries import ones_at
+from trackmdp.arrays.types import IndexArray
 from trackmdp.config.credit import PerSensorConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.acting import Exploring
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.table import PolicyTable
+from trackmdp.recordings.tracks import Tracks
 from trackmdp.seeding import generator
-from trackmdp.world.entries import ones_at
-from trackmdp.world.model import IndexArray, Task
-from trackmdp.world.tracks import Tracks
-from trackmdp.world.windows import Window
+from trackmdp.sensing.task import Task
+from trackmdp.sensing.windows import Window
 
 _MOST_CELLS_OF_NETS = 4_096
 """Above, embeddings of each (cell, clock) take time and memory that tables do not. At N = 32 tables end .007 per step

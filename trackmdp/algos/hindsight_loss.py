@@ -15,9 +15,10 @@ from trackmdp.algos.actor_loss import ActorLoss, SensorCredit, decision_loss
 from trackmdp.algos.gains import chain_returns, clocked_advantage, gather, scatter_add, sensing_gain
 from trackmdp.algos.in_view import SensorsInView
 from trackmdp.algos.path_replay import Replay
+from trackmdp.arrays.types import IndexArray
 from trackmdp.policies.nets import CellClockNet
-from trackmdp.world.model import IndexArray, Task
-from trackmdp.world.windows import Window
+from trackmdp.sensing.task import Task
+from trackmdp.sensing.windows import Window
 
 # Weights of the clocks (`_weights`): the running mean gain moves a tenth of the way at each update; a clock with fewer
 # than 20 rows, or a mean gain under .2 r, is not magnified any further, or a handful of rows would rule the step.

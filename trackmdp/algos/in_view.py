@@ -3,8 +3,8 @@
 A set of sensors earns the gain of a report in each cell that it covers. With one sensor in each cell that sum falls
 apart, and a cell's gain is its sensor's. With footprints sensors share cells: a sensor gains the reports that none of
 the others makes. Sets from which no change of one sensor gains are local optima of the weighted coverage
-(`solvers/cover.py`). Where the others are on with probabilities, it gains the expectation of that, the slope of the
-multilinear extension of coverage (Calinescu et al. 2011), with maxima at sets.
+(`sensing/cover.py`). Where the others are on with probabilities, it gains the expectation of that, the slope of
+the multilinear extension of coverage (Calinescu et al. 2011), with maxima at sets.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from scipy import sparse
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from trackmdp.solvers.cover import Shared
-from trackmdp.world.entries import padded_rows, ranks
-from trackmdp.world.model import AnyArray, IndexArray, Task
-from trackmdp.world.windows import Window
+from trackmdp.arrays.entries import padded_rows, ranks
+from trackmdp.arrays.types import AnyArray, IndexArray
+from trackmdp.sensing.cover import Shared
+from trackmdp.sensing.task import Task
+from trackmdp.sensing.windows import Window
 
 _CERTAIN = 1.0 - 2.0**-23
 """Stands for a probability of 1 where its logarithm is needed."""

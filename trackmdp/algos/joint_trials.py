@@ -14,12 +14,13 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.policies.table import PolicyTable
+from trackmdp.sensing.decisions import sensing
+from trackmdp.sensing.task import Task
 from trackmdp.solvers.exchange import exchange
 from trackmdp.solvers.plans import Layout, Plans, Turn
 from trackmdp.solvers.search import candidates_of, columns_of
-from trackmdp.solvers.sensing import sensing
-from trackmdp.world.model import Array, BoolArray, IndexArray, Task
 
 _ROUNDS, _JUDGES, _SURE = 3, 10, 3.0
 """Rounds at most; batches of paths that judge; standard errors of its gain that a proposal has to exceed."""

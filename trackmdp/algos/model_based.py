@@ -32,12 +32,13 @@ from trackmdp.policies.acting import RenewedTable
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.saved import packed, unpacked_policy
 from trackmdp.policies.table import PolicyTable
+from trackmdp.recordings.tracks import Tracks
 from trackmdp.seeding import derive
+from trackmdp.sensing.task import Task
 from trackmdp.solvers import exchange, hidden
 from trackmdp.solvers.linear import DIRECT_CELLS
 from trackmdp.solvers.value import value_of
-from trackmdp.world.model import Task, World
-from trackmdp.world.tracks import Tracks
+from trackmdp.world.model import World
 
 _PRIOR, _EXIT_PRIOR = 0.1, 100.0
 """Moves as many as which the pooled motion, and the pooled exit probability, count in kernels that are drawn or infer

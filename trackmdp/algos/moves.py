@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
 
-from trackmdp.world.model import Task
+from trackmdp.sensing.task import Task
 
 
 def cell_dtype(num_cells: int) -> torch.dtype:

@@ -19,11 +19,12 @@ from trackmdp.algos.estimates.censored import ObservedPaths, hidden_cells
 from trackmdp.algos.estimates.hidden_cells import Missed, redrawn
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.moves import known_as
-from trackmdp.world.coverage import reported
-from trackmdp.world.entries import ones_at
-from trackmdp.world.model import Array, BoolArray, IndexArray, Indices, Task
-from trackmdp.world.tracks import Tracks, ends_of
-from trackmdp.world.windows import Window
+from trackmdp.arrays.entries import ones_at
+from trackmdp.arrays.types import Array, BoolArray, IndexArray, Indices
+from trackmdp.recordings.tracks import Tracks, ends_of
+from trackmdp.sensing.coverage import reported
+from trackmdp.sensing.task import Task
+from trackmdp.sensing.windows import Window
 
 _ENDING = 8
 """Cells at the end of a path that identify its recording: wherever a path began, it ends as its recording."""

@@ -32,8 +32,8 @@ from trackmdp.config.learning import ActorCriticConfig, PpoConfig
 from trackmdp.policies.joint_nets import last_clock
 from trackmdp.policies.nets import make_actor, make_critic
 from trackmdp.seeding import generator
-from trackmdp.world.model import Task
-from trackmdp.world.outcomes import Costs
+from trackmdp.sensing.outcomes import Costs
+from trackmdp.sensing.task import Task
 
 _KEPT = ("action", "action_log_prob", "action_mask", "advantage", "value_target")
 

@@ -16,9 +16,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from trackmdp.algos.gains import gather
-from trackmdp.world.memory import KeySpace
-from trackmdp.world.model import Task
-from trackmdp.world.windows import Window
+from trackmdp.memory.keys import KeySpace
+from trackmdp.sensing.task import Task
+from trackmdp.sensing.windows import Window
 
 
 class Replay:

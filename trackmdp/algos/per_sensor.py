@@ -8,7 +8,7 @@ from trackmdp.algos.actor_loss import ActorLoss, Poisson, PolicyGradient, Surrog
 from trackmdp.algos.hindsight import Hindsight
 from trackmdp.config.credit import A2cPerSensorConfig, PpoPerSensorConfig
 from trackmdp.errors import UserError
-from trackmdp.world.model import Task
+from trackmdp.sensing.task import Task
 
 
 class PerSensorA2C(Hindsight):

@@ -14,9 +14,9 @@ from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.estimates.path_plans import parted
 from trackmdp.algos.moves import CellIndex, MoveBuffer, cell_dtype
 from trackmdp.algos.observed import EM_ROUNDS, SensedPaths, observed_paths
-from trackmdp.world.entries import row_index
-from trackmdp.world.model import Task
-from trackmdp.world.tracks import Tracks
+from trackmdp.arrays.entries import row_index
+from trackmdp.recordings.tracks import Tracks
+from trackmdp.sensing.task import Task
 
 
 class SegmentBuffer:

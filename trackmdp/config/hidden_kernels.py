@@ -44,7 +44,7 @@ class HiddenKernelConfig(KernelConfig):
         require_able(root, "remembers", f"with kernel={self.name}")
 
 
-@choice("kernel", "heading", makes="trackmdp.world.modes:heading_kernel")
+@choice("kernel", "heading", makes="trackmdp.motion.modes:heading_kernel")
 class HeadingConfig(HiddenKernelConfig):
     """A target with one of eight headings, hidden from the tracker; at the border it turns back."""
 
@@ -57,7 +57,7 @@ class HeadingConfig(HiddenKernelConfig):
     exit_probability: float = option("probability of leaving the grid", unit="per step", gt=0, lt=1)
 
 
-@choice("kernel", "regimes", makes="trackmdp.world.modes:regimes")
+@choice("kernel", "regimes", makes="trackmdp.motion.modes:regimes")
 class RegimesConfig(HiddenKernelConfig):
     """A target that switches between other kernels, such as to linger and to travel; the one in force is its mode.
 
@@ -134,12 +134,12 @@ class VelocityConfig(HiddenKernelConfig):
                 raise refuse(f"{key}.{name}", getattr(self, name), expected)
 
 
-@choice("kernel", "constant_velocity", makes="trackmdp.world.modes:constant_velocity")
+@choice("kernel", "constant_velocity", makes="trackmdp.motion.modes:constant_velocity")
 class ConstantVelocityConfig(VelocityConfig):
     """Nearly constant velocity, the mode, in metres and seconds; displacements have its mean exactly, never rounded."""
 
 
-@choice("kernel", "coordinated_turn", makes="trackmdp.world.modes:coordinated_turn")
+@choice("kernel", "coordinated_turn", makes="trackmdp.motion.modes:coordinated_turn")
 class CoordinatedTurnConfig(VelocityConfig):
     """As constant_velocity, but the target turns left, right or not at all; turn and velocity are the mode."""
 

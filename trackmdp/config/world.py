@@ -21,10 +21,10 @@ from trackmdp.errors import UserError
 BORDERS = ("renormalize", "inside", "clip", "exit")
 CRS_CODE = "[A-Za-z]+:[0-9]{1,9}"
 MEMORIES = {
-    "cell": "trackmdp.world.memory:Cell",
-    "displacement": "trackmdp.world.memory:Displacement",
-    "displacement_gap": "trackmdp.world.memory:DisplacementGap",
-    "two_displacements": "trackmdp.world.memory:TwoDisplacements",
+    "cell": "trackmdp.memory.keys:Cell",
+    "displacement": "trackmdp.memory.keys:Displacement",
+    "displacement_gap": "trackmdp.memory.keys:DisplacementGap",
+    "two_displacements": "trackmdp.memory.keys:TwoDisplacements",
 }
 """Memories of policies: the class of each name. A plugin adds its own, before its configs are composed."""
 
@@ -148,7 +148,7 @@ class ExitingConfig(KernelConfig):
     border: str = option("rule for positions outside the grid", choices=BORDERS)
 
 
-@choice("kernel", "random_support", makes="trackmdp.world.kernels:random_support")
+@choice("kernel", "random_support", makes="trackmdp.motion.kernels:random_support")
 class RandomSupportConfig(ExitingConfig):
     """The paper's motion: Z random positions around each cell, one of low probability, the others equal."""
 
@@ -174,7 +174,7 @@ class RandomSupportConfig(ExitingConfig):
             raise refuse(f"{key}.low_probability", self.low_probability, expected)
 
 
-@choice("kernel", "random_walk", makes="trackmdp.world.kernels:random_walk")
+@choice("kernel", "random_walk", makes="trackmdp.motion.kernels:random_walk")
 class RandomWalkConfig(ExitingConfig):
     """A lazy random walk on the 4 or 8 neighbours."""
 
@@ -182,7 +182,7 @@ class RandomWalkConfig(ExitingConfig):
     diagonal: bool = option("whether the 4 diagonal neighbours are reached as well")
 
 
-@choice("kernel", "drift", makes="trackmdp.world.kernels:drift")
+@choice("kernel", "drift", makes="trackmdp.motion.kernels:drift")
 class DriftConfig(ExitingConfig):
     """A target that heads one way most of the time."""
 
@@ -190,7 +190,7 @@ class DriftConfig(ExitingConfig):
     persistence: float = share_option("probability of keeping to the heading", unit="per step")
 
 
-@choice("kernel", "table", makes="trackmdp.world.kernels:load_table")
+@choice("kernel", "table", makes="trackmdp.motion.kernels:load_table")
 class TableConfig(KernelConfig):
     """A table of your own: row i holds the probabilities of moving from cell i to each cell."""
 

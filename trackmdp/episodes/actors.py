@@ -30,11 +30,11 @@ from trackmdp.policies.forms import (
 )
 from trackmdp.policies.policy import Policy, PolicyLike, as_policy, looked_up
 from trackmdp.policies.table import SetTable
-from trackmdp.world.actions import ActionMask
-from trackmdp.world.detection import Detection
-from trackmdp.world.model import Task
-from trackmdp.world.outcomes import Costs
-from trackmdp.world.windows import Window
+from trackmdp.sensing.actions import ActionMask
+from trackmdp.sensing.detection import Detection
+from trackmdp.sensing.outcomes import Costs
+from trackmdp.sensing.task import Task
+from trackmdp.sensing.windows import Window
 
 _MOST_ROWS = 4096  # episodes stepped together: their generators take 5 kB each
 _DRAWS = 25_600  # of one step: 256 steps of them are held at a time, 26 MB
@@ -47,7 +47,7 @@ class States:
 
     Attributes:
         row: `[B]` which episodes of the batch these are.
-        place: `[B]` of the targets (`world/targets.py`), for the simulator's eyes.
+        place: `[B]` of the targets (`environment/targets.py`), for the simulator's eyes.
         last_cell: `[B]` cell of the last detection.
         key: `[B]` the policy's key at it; the cell alone for most policies.
         misses: `[B]` n since then.

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from trackmdp.arrays.types import AnyArray, Array, BoolArray, Indices
 from trackmdp.episodes.belief_filter import beliefs
 from trackmdp.episodes.episode import Episode, Floats, last_cells
 from trackmdp.episodes.episode_draws import Columns
@@ -20,8 +21,7 @@ from trackmdp.episodes.grids import check_layers
 from trackmdp.episodes.showing import Showing
 from trackmdp.notebook.card import Card, decimal, grid_words, percent
 from trackmdp.policies.policy import Policy
-from trackmdp.world.model import AnyArray, Array, BoolArray, Indices
-from trackmdp.world.tracks import Problem
+from trackmdp.world.problem import Problem
 
 _BELIEF = 25_600  # cells, or hidden states, of the beliefs updated together: memory stays bounded on large grids
 

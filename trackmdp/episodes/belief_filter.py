@@ -7,10 +7,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays.types import AnyArray, BoolArray, Indices
 from trackmdp.episodes.episode import Episode, Floats
 from trackmdp.policies.belief import BeliefFilter
-from trackmdp.world.coverage import reported
-from trackmdp.world.model import AnyArray, BoolArray, Indices, Task, World
+from trackmdp.sensing.coverage import reported
+from trackmdp.sensing.task import Task
+from trackmdp.world.model import World
 
 
 def beliefs(world: World, episodes: Sequence[Episode]) -> list[Floats]:

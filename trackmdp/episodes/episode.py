@@ -12,9 +12,10 @@ import numpy.typing as npt
 import torch
 from tensordict import TensorDict
 
+from trackmdp.arrays.types import AnyArray, Array, BoolArray, Indices
 from trackmdp.notebook.card import Card, Carded, Facts, decimal
-from trackmdp.world.model import AnyArray, Array, BoolArray, Indices, Task
-from trackmdp.world.windows import Window
+from trackmdp.sensing.task import Task
+from trackmdp.sensing.windows import Window
 
 Floats: TypeAlias = npt.NDArray[np.float32]
 

@@ -11,10 +11,10 @@ import numpy as np
 
 from trackmdp.episodes.episode import Episode, Recording
 from trackmdp.episodes.target_colours import COLOURS
+from trackmdp.sensing.task import Task
 from trackmdp.solvers import bounds
 from trackmdp.world.group import Group
-from trackmdp.world.model import Task
-from trackmdp.world.tracks import Problem
+from trackmdp.world.problem import Problem
 
 MOST_STEPS = 2000
 """Steps on a page, or frames of a video; a longer episode is cut there, with a note on the page."""

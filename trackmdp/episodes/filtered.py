@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.seeding import derive
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.evaluation import ReplayedTracks
 from trackmdp.solvers.false_alarms import check_alarms
-from trackmdp.world.model import Array, BoolArray, IndexArray, World
-from trackmdp.world.tracks import Problem
+from trackmdp.world.model import World
+from trackmdp.world.problem import Problem
 
 _NEVER = 1e-12
 """Stands for p_f = 0, so that the evidence of a report is finite."""

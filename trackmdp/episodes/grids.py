@@ -13,10 +13,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from trackmdp.arrays.types import AnyArray, BoolArray
 from trackmdp.episodes.episode import Episode, Floats
 from trackmdp.episodes.schema import clock_of, json_bytes
 from trackmdp.machine import check_free
-from trackmdp.world.model import AnyArray, BoolArray
 
 WHOLE_CELLS = 64 * 64
 """Cells up to which belief and policy are written whole; of a larger grid, where either is more than 0."""

@@ -11,9 +11,10 @@ import numpy.typing as npt
 from scipy import sparse
 from tensordict import TensorDict
 
+from trackmdp.arrays.types import AnyArray, BoolArray, Indices
 from trackmdp.episodes.episode import Episode, Recording
 from trackmdp.notebook.card import Card
-from trackmdp.world.model import AnyArray, BoolArray, Indices, Task
+from trackmdp.sensing.task import Task
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -8,15 +8,15 @@ from functools import cached_property
 
 import numpy as np
 
+from trackmdp.arrays.types import Array
 from trackmdp.episodes.group_episode import GroupEpisode
 from trackmdp.episodes.group_simulate import AT_ONCE, group_episodes
 from trackmdp.episodes.showing import Showing
 from trackmdp.notebook.card import Card, grid_words
-from trackmdp.solvers.group_figures import GroupEvaluation, with_ends
-from trackmdp.solvers.group_value import known_mean, known_rewards
-from trackmdp.solvers.merging import Rule
+from trackmdp.solvers.several.group_figures import GroupEvaluation, with_ends
+from trackmdp.solvers.several.group_value import known_mean, known_rewards
+from trackmdp.solvers.several.merging import Rule
 from trackmdp.world.group import Group
-from trackmdp.world.model import Array
 
 _BELIEFS = 2**22
 """Numbers of the beliefs that are kept together, at most, if a target may be in 30 cells in each of 100 steps."""

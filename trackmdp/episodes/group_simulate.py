@@ -10,12 +10,12 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
+from trackmdp.arrays.types import IndexArray
+from trackmdp.environment.group_paths import GroupPaths, group_paths
 from trackmdp.episodes.episode_draws import Columns, Draws, joined, uniform
 from trackmdp.episodes.group_episode import GroupEpisode
-from trackmdp.solvers.merging import Beliefs, Clocks, Rule, followed
-from trackmdp.world.group_paths import GroupPaths, group_paths
-from trackmdp.world.model import IndexArray
-from trackmdp.world.outcomes import Costs
+from trackmdp.sensing.outcomes import Costs
+from trackmdp.solvers.several.merging import Beliefs, Clocks, Rule, followed
 
 AT_ONCE = 4096
 """Targets of the episodes that are stepped together; 256 steps of their draws are held, 8 MB."""

@@ -22,7 +22,7 @@ from trackmdp.training.callbacks import Callback, Training
 from trackmdp.training.evaluator import Score
 from trackmdp.untrusted import reason
 from trackmdp.world.group import Group
-from trackmdp.world.tracks import Problem
+from trackmdp.world.problem import Problem
 
 
 class EpisodeLog:

@@ -13,7 +13,7 @@ from trackmdp.episodes.episode import Episode, Recording
 from trackmdp.episodes.grids import grid_messages, read_grids
 from trackmdp.episodes.schema import LoggedRun, json_bytes, tick_of, time_of
 from trackmdp.errors import UserError
-from trackmdp.world.coverage import Coverage
+from trackmdp.sensing.coverage import Coverage
 
 
 class Form:

@@ -18,10 +18,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from trackmdp.episodes.episode import Recording
-from trackmdp.episodes.sentences import sentence
-from trackmdp.world.model import IndexArray, Task
-from trackmdp.world.render import (
+from trackmdp.arrays.types import IndexArray
+from trackmdp.environment.render import (
     FOUND,
     FOUND_OF_SEVERAL,
     LEGEND_OF_SEVERAL,
@@ -31,6 +29,9 @@ from trackmdp.world.render import (
     around,
     symbols,
 )
+from trackmdp.episodes.episode import Recording
+from trackmdp.episodes.sentences import sentence
+from trackmdp.sensing.task import Task
 
 WIDE, STEP = 37, 9
 """Rows and columns of a grid that are drawn at most, which 80 characters hold, and how far the part drawn moves at

@@ -23,12 +23,12 @@ from trackmdp.episodes.written import form_of
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import unpacked_policy
-from trackmdp.solvers.merging import Rule, make_rule
+from trackmdp.solvers.several.merging import Rule, make_rule
 from trackmdp.training.group_run import joint_policy
 from trackmdp.untrusted import load_npz
 from trackmdp.world.group import Group
+from trackmdp.world.problem import Problem
 from trackmdp.world.problem_file import PROBLEM, problem_in
-from trackmdp.world.tracks import Problem
 
 
 class EpisodeReader:

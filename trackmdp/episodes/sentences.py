@@ -6,8 +6,10 @@ import math
 
 import numpy as np
 
+from trackmdp.arrays.types import BoolArray
 from trackmdp.episodes.episode import Recording
-from trackmdp.world.model import BoolArray, Task, World
+from trackmdp.sensing.task import Task
+from trackmdp.world.model import World
 
 _ARROWS = "→↗↑↖←↙↓↘"
 _STILL = 0.05

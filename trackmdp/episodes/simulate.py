@@ -13,6 +13,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from trackmdp.environment.paths import PathSampler, path_sampler
 from trackmdp.episodes.actors import Actor, States, actor_of
 from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.episode_draws import Columns, Draws, joined, uniform
@@ -22,14 +23,13 @@ from trackmdp.machine import check_free
 from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import PolicyLike
 from trackmdp.seeding import derive, preserved_global_rng
+from trackmdp.sensing.outcomes import Costs, Outcomes
 from trackmdp.solvers.evaluate import group_rule
-from trackmdp.solvers.merging import Rule
+from trackmdp.solvers.several.merging import Rule
 from trackmdp.solvers.solve import named_policy
 from trackmdp.solvers.value import check_revealed
 from trackmdp.world.group import Group, check_problem
-from trackmdp.world.outcomes import Costs, Outcomes
-from trackmdp.world.paths import PathSampler, path_sampler
-from trackmdp.world.tracks import Problem
+from trackmdp.world.problem import Problem
 
 
 @overload

@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from trackmdp.arrays.types import BoolArray
 from trackmdp.episodes.episode import Recording
 from trackmdp.episodes.episode_page import MOST_STEPS
 from trackmdp.episodes.sentences import sentence
 from trackmdp.episodes.target_colours import colour_of
 from trackmdp.errors import UserError, require
 from trackmdp.notebook.drawing import BLUE, INK, ORANGE
-from trackmdp.world.model import BoolArray, Task
+from trackmdp.sensing.task import Task
 
 _DPI = 110
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from mcap.writer import Writer
 
+from trackmdp.arrays.files import npz_bytes
 from trackmdp.durable import create, sync, sync_folder
 from trackmdp.episodes import schema
 from trackmdp.episodes.episode import Recording
@@ -18,12 +19,12 @@ from trackmdp.episodes.schema import LoggedRun, time_of
 from trackmdp.episodes.written import form_of
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import packed
-from trackmdp.solvers.merging import Rule
+from trackmdp.recordings.tracks import Recorded
+from trackmdp.solvers.several.merging import Rule
 from trackmdp.untrusted import decoded
-from trackmdp.world.files import npz_bytes
 from trackmdp.world.group import Group
+from trackmdp.world.problem import Problem
 from trackmdp.world.problem_file import PROBLEM, problem_bytes, problem_in
-from trackmdp.world.tracks import Problem, Recorded
 
 FLUSH_STEPS = 100
 """An episode's end closes the chunk once so many steps are in it, and hands it to the operating system."""

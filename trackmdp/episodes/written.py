@@ -5,7 +5,7 @@ from __future__ import annotations
 from trackmdp.episodes.group_messages import GroupForm
 from trackmdp.episodes.messages import Form
 from trackmdp.episodes.schema import LoggedRun
-from trackmdp.world.coverage import Coverage
+from trackmdp.sensing.coverage import Coverage
 
 
 def form_of(run: LoggedRun, coverage: Coverage | None = None) -> Form:

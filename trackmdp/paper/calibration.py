@@ -16,15 +16,15 @@ from typing import Any
 
 import numpy as np
 
+from trackmdp.arrays.types import Array
 from trackmdp.durable import write_text
+from trackmdp.motion.kernels import Border
 from trackmdp.paper import theorems
 from trackmdp.paper.check import Check
 from trackmdp.paper.worlds import COSTS, PRINTED_QMDP, SUPPORTS, paper_kernel, paper_world
 from trackmdp.solvers import bounds, optimal, rules
 from trackmdp.solvers.value import value_of
 from trackmdp.untrusted import decoded, read_object
-from trackmdp.world.kernels import Border
-from trackmdp.world.model import Array
 
 BORDER: Border = "renormalize"
 T_MAX = 1

@@ -9,8 +9,9 @@ import itertools
 
 import numpy as np
 
+from trackmdp.arrays.types import Array, Indices
 from trackmdp.policies.table import PolicyTable
-from trackmdp.world.model import Array, Indices, World
+from trackmdp.world.model import World
 
 _SETTLED = 1e-14
 

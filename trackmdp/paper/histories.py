@@ -14,9 +14,10 @@ from typing import TypeAlias
 
 import numpy as np
 
+from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.policies.belief import BeliefFilter
 from trackmdp.solvers.pomdp import FiniteMdp
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.model import World
 
 State: TypeAlias = tuple[int, tuple[int, ...]]
 """Last located cell, and the sets sensed since, each as its row in `actions`."""

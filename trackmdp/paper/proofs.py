@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from trackmdp.arrays.types import Array
 from trackmdp.paper.check import NO_CASE, Check
 from trackmdp.paper.corner import changed
 from trackmdp.paper.exhaustive import (
@@ -19,11 +20,11 @@ from trackmdp.paper.exhaustive import (
 )
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, optimal, pomdp, rules
-from trackmdp.solvers.inner import InnerProblem
-from trackmdp.solvers.known import planted, up_to
+from trackmdp.solvers.certify.inner import InnerProblem
+from trackmdp.solvers.certify.known import planted, up_to
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.value import value_of
-from trackmdp.world.model import Array, World
+from trackmdp.world.model import World
 
 BUDGETS = (1, 10, 100, 1_000_000)
 """Choices after which a search is cut; the last one ends it."""

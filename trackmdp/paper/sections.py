@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from trackmdp.arrays.types import Array
 from trackmdp.paper import calibration
 from trackmdp.paper.calibration import DRAWS, Candidate, Openings, Setting, Spread, chosen
 from trackmdp.paper.check import Check
@@ -18,7 +19,6 @@ from trackmdp.reports.grouping import Study
 from trackmdp.reports.page import Part, Section
 from trackmdp.reports.style import INK, LOOKS, Axes, Canvas, Figure, draw_figure, legend, tidy
 from trackmdp.reports.tables import Cell, Column, Rows, Table, paragraphs
-from trackmdp.world.model import Array
 
 # One colour per Z through all figures of this part; they are those of methods, which do not occur here.
 COLOURS = dict(zip(SUPPORTS, (LOOKS[0], LOOKS[2], LOOKS[1]), strict=True))

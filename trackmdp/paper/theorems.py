@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.paper import histories, proofs
 from trackmdp.paper.check import NO_CASE, Check
 from trackmdp.paper.corner import changed, corner, dearer
@@ -17,7 +18,7 @@ from trackmdp.solvers import optimal as optimum
 from trackmdp.solvers.hidden import averaged
 from trackmdp.solvers.solution import Solution
 from trackmdp.solvers.value import value_of
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.model import World
 
 SLACK = 1e-10
 """Relative rounding that equalities are allowed, and the gap at which a search for the optimum ends."""

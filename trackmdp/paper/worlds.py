@@ -8,9 +8,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from trackmdp.arrays.types import Array
+from trackmdp.motion.kernels import Border, random_support
 from trackmdp.reports.grouping import Study
-from trackmdp.world.kernels import Border, random_support
-from trackmdp.world.model import Array, World
+from trackmdp.world.model import World
 
 SUPPORTS = (3, 4, 5)
 """Z, the positions that the target may move to from a cell."""

@@ -13,10 +13,11 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from trackmdp.arrays.types import BoolArray
 from trackmdp.errors import UserError
 from trackmdp.policies.lookup import in_window
 from trackmdp.policies.table import PolicyTable
-from trackmdp.world.model import BoolArray, Task
+from trackmdp.sensing.task import Task
 
 _ROWS_AT_ONCE = 2**12
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 
-from trackmdp.world.model import AnyArray, Array, Indices
+from trackmdp.arrays.types import AnyArray, Array, Indices
 
 
 class BeliefFilter:

@@ -16,13 +16,14 @@ import torch
 from torch import Tensor, nn
 
 from trackmdp import __version__
+from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.durable import write_bytes
 from trackmdp.errors import UserError, require
 from trackmdp.policies.forms import adapted
 from trackmdp.policies.geojson import map_features
 from trackmdp.policies.saved import listable
 from trackmdp.policies.table import PolicyTable
-from trackmdp.world.model import Array, BoolArray, Task
+from trackmdp.sensing.task import Task
 
 _LARGEST = 2**31  # entries, a byte each
 

@@ -17,11 +17,11 @@ from torch import Tensor
 from torchrl.envs import transforms
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
+from trackmdp.environment.observation import ObservationVector
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.world.actions import checked_action
-from trackmdp.world.model import Task
-from trackmdp.world.observation import ObservationVector
+from trackmdp.sensing.actions import checked_action
+from trackmdp.sensing.task import Task
 
 STATE_KEYS = ("last_cell", "steps_since_detection", "action_history")
 _VECTOR = "observation"

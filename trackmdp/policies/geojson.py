@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError
+from trackmdp.grid.place import Place
 from trackmdp.policies.saved import LISTED_CELLS
 from trackmdp.policies.table import PolicyTable
-from trackmdp.world.model import Array
-from trackmdp.world.place import Place
 
 
 def map_features(policy: PolicyTable, value: Array | None = None) -> dict[str, Any]:

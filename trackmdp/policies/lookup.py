@@ -6,9 +6,9 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
-from trackmdp.world.entries import row_index
-from trackmdp.world.model import Task
-from trackmdp.world.windows import Window
+from trackmdp.arrays.entries import row_index
+from trackmdp.sensing.task import Task
+from trackmdp.sensing.windows import Window
 
 
 def in_window(task: Task, sets: sparse.csr_array) -> sparse.csr_array:

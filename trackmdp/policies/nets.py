@@ -23,8 +23,8 @@ from torchrl.modules import ProbabilisticActor, ValueOperator
 from trackmdp.policies.few_sensors import FewSensors, greedy
 from trackmdp.policies.forms import state_keys
 from trackmdp.policies.joint_nets import last_clock, of_kinds
-from trackmdp.world.model import Task
-from trackmdp.world.windows import Window
+from trackmdp.sensing.task import Task
+from trackmdp.sensing.windows import Window
 
 _PAIRS = (
     2**16

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from trackmdp.arrays.entries import ones_at
 from trackmdp.errors import require
+from trackmdp.grid.place import Place
+from trackmdp.sensing.task import Task
 from trackmdp.untrusted import LARGE, decoded, read_bytes
-from trackmdp.world.entries import ones_at
-from trackmdp.world.model import Task
-from trackmdp.world.place import Place
 
 
 class OnnxTable:

@@ -21,6 +21,8 @@ from torch import Tensor
 from torchrl.envs.transforms import Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from trackmdp.arrays.entries import with_data
+from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError
 from trackmdp.policies.forms import (
     STATE_KEYS,
@@ -40,9 +42,8 @@ from trackmdp.policies.saved import load_policy, save_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.policies.tracker import Tracker
 from trackmdp.policies.unroll import draws, mixture, unrolled
-from trackmdp.world.entries import with_data
-from trackmdp.world.model import Array, Task
-from trackmdp.world.windows import Window
+from trackmdp.sensing.task import Task
+from trackmdp.sensing.windows import Window
 
 PolicyLike: TypeAlias = Any
 """A policy or its table, a TensorDict module, a function as `Policy.from_function` takes it, or an object that holds a

@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from trackmdp.arrays.files import npz_bytes, whole_csr
+from trackmdp.arrays.types import AnyArray, Array
 from trackmdp.durable import write_bytes, write_json
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
+from trackmdp.sensing.task import Task
 from trackmdp.untrusted import LARGE, decoded, load_npz, opened, read_object
-from trackmdp.world.files import npz_bytes, whole_csr
-from trackmdp.world.model import AnyArray, Array, Task
 from trackmdp.world.problem_file import as_arrays, from_arrays
 
 LISTED_CELLS, LISTED_NUMBERS = 20_000, 2**21

@@ -13,11 +13,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from trackmdp.arrays.entries import ones_at, row_index, short_indices
+from trackmdp.arrays.types import AnyArray, Array, BoolArray
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, decimal, grid_words
-from trackmdp.world.coverage import reported, shared_out
-from trackmdp.world.entries import ones_at, row_index, short_indices
-from trackmdp.world.model import AnyArray, Array, BoolArray, Task, window_cells
+from trackmdp.sensing.coverage import reported, shared_out
+from trackmdp.sensing.task import Task, window_cells
 
 _AT_ONCE = 2**19
 """Entries looked up at once: some 16 MB of intermediate arrays, however large the grid."""
@@ -139,7 +140,7 @@ class SetTable:
 
 
 class PolicyTable(Carded, SetTable):
-    """Which sensors are on n misses after the target was located: one open-loop plan for each key (`world/memory.py`).
+    """Which sensors are on n misses after the target was located: one open-loop plan for each key (`memory/keys.py`).
 
     With `task.memory` "cell" the key is the located cell x. A policy has its own memory: a policy of one memory
     may be valued in a task of another.

@@ -10,12 +10,13 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
+from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.errors import UserError
 from trackmdp.policies.belief import BeliefFilter
 from trackmdp.policies.onnx_table import OnnxTable
 from trackmdp.policies.saved import load_policy
 from trackmdp.policies.table import PolicyTable
-from trackmdp.world.model import Array, BoolArray, Task
+from trackmdp.sensing.task import Task
 
 _NUMBERS = ("key", "misses", "steps", "seed")
 
@@ -99,7 +100,7 @@ class Tracker:
 
     @property
     def key(self) -> int:
-        """The memory left by the last detection (`trackmdp.world.memory`); the cell, where that is all."""
+        """The memory left by the last detection (`trackmdp.memory.keys`); the cell, where that is all."""
         return self._key
 
     @property

@@ -15,6 +15,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torch import Tensor, distributions
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from trackmdp.arrays.types import AnyArray
 from trackmdp.policies.forms import (
     TAKE_ITS_MODE,
     DrawsError,
@@ -24,9 +25,9 @@ from trackmdp.policies.forms import (
     state_keys,
 )
 from trackmdp.seeding import preserved_global_rng
-from trackmdp.world.actions import ActionMask
-from trackmdp.world.model import AnyArray, Task
-from trackmdp.world.windows import Window
+from trackmdp.sensing.actions import ActionMask
+from trackmdp.sensing.task import Task
+from trackmdp.sensing.windows import Window
 
 _HISTORY_AT_ONCE = 2**22
 """Entries of the action history in one block; the size of a net's activations follows from it."""

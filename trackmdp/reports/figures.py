@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trackmdp.arrays.types import Array
 from trackmdp.reports.grouping import Study
 from trackmdp.reports.style import (
     INK,
@@ -25,7 +26,6 @@ from trackmdp.reports.style import (
 from trackmdp.reports.tables import Column, Rows, Table, interval_columns
 from trackmdp.reports.ticks import label_values
 from trackmdp.statistics import MeanInterval, mean_over_groups, share
-from trackmdp.world.model import Array
 
 # A policy may attain the bound, and zero has no logarithm.
 FLOOR = 1e-5

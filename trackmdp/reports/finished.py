@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays.entries import per_row
+from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.config.tree import flatten
 from trackmdp.errors import UserError
 from trackmdp.policies.saved import load_policy
@@ -19,11 +21,11 @@ from trackmdp.reports.maps import MOST_MAP_CELLS
 from trackmdp.reports.results import FIGURES, HELD_OUT, FinishedRun, Mapped, checked
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.hidden import averaged
-from trackmdp.solvers.linear import DIRECT_CELLS, per_row
+from trackmdp.solvers.linear import DIRECT_CELLS
 from trackmdp.solvers.value import key_visits, value_of
 from trackmdp.training.folders import METRICS, SUMMARY, check_files, read_summary
 from trackmdp.untrusted import LARGE, decoded, parse_yaml, read_text
-from trackmdp.world.model import Array, IndexArray, World
+from trackmdp.world.model import World
 from trackmdp.world.problem_file import PROBLEM, read_problem
 
 MOST_POINTS = 16

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from trackmdp.arrays.types import Array
 from trackmdp.episodes.episode import Episode
+from trackmdp.recordings.gridding import said
+from trackmdp.recordings.tracks import Recorded
 from trackmdp.reports.page import Report, Section
 from trackmdp.reports.tables import Cell, Column, Rows, Table, interval_columns, paragraphs
 from trackmdp.solvers.evaluation import ReplayedTracks
-from trackmdp.world.gridding import said
-from trackmdp.world.model import Array
-from trackmdp.world.tracks import Recorded
 
 _STEPS = 8
 """Steps of a track that are drawn."""

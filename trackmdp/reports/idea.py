@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.reports.results import Mapped
 from trackmdp.reports.style import (
     BLUE,
@@ -19,7 +20,6 @@ from trackmdp.reports.style import (
     grid_lines,
 )
 from trackmdp.reports.tables import Column, Rows, Table
-from trackmdp.world.model import Array, BoolArray
 
 _MARGIN = 1
 """Cells shown around all that happens."""

@@ -10,6 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.reports.results import Mapped
 from trackmdp.reports.style import (
     BLUE,
@@ -23,7 +24,6 @@ from trackmdp.reports.style import (
     grid_lines,
 )
 from trackmdp.reports.tables import Column, Rows, Table
-from trackmdp.world.model import Array, BoolArray
 
 # 20 x 20: with tiles of four to six cells each, more would not be seen on a page.
 MOST_MAP_CELLS = 400

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays.files import npz_bytes
+from trackmdp.arrays.types import Array
 from trackmdp.durable import write_bytes
 from trackmdp.untrusted import decoded, load_npz, printable, read_bytes
-from trackmdp.world.files import npz_bytes
-from trackmdp.world.model import Array
 from trackmdp.world.problem_file import as_arrays, from_arrays
 
 RESULTS = "results.npz"

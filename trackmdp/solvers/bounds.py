@@ -12,19 +12,19 @@ from functools import lru_cache
 import numpy as np
 from scipy import sparse
 
-from trackmdp.solvers.choose import Decisions, Own, priced
-from trackmdp.solvers.cover import Shared
+from trackmdp.arrays.entries import per_row, row_index, with_data
+from trackmdp.arrays.types import AnyArray, Array, BoolArray
+from trackmdp.sensing.choose import Decisions, Own, priced
+from trackmdp.sensing.cover import Shared
+from trackmdp.sensing.decisions import sensing
 from trackmdp.solvers.linear import (
     RenewalSystem,
     accumulate,
     expected_steps,
     grid_of,
-    per_row,
     still_to_come,
 )
-from trackmdp.solvers.sensing import sensing
-from trackmdp.world.entries import row_index, with_data
-from trackmdp.world.model import AnyArray, Array, BoolArray, World
+from trackmdp.world.model import World
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trackmdp.arrays.entries import per_row
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers.inner import InnerProblem
-from trackmdp.solvers.known import tables, up_to
-from trackmdp.solvers.linear import per_row
+from trackmdp.solvers.certify.inner import InnerProblem
+from trackmdp.solvers.certify.known import tables, up_to
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.value import key_visits, value_of
 from trackmdp.solvers.walk import Step
-from trackmdp.world.model import Array, BoolArray, IndexArray, World
+from trackmdp.world.model import World
 
 _MOST_NODES = 100_000
 """Choices looked at per table; where it ends early, W is an upper bound, and the exact form is exact all the same."""

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, overload
 
+from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import value
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.false_alarms import believed
-from trackmdp.solvers.group_figures import GroupEvaluation
-from trackmdp.solvers.group_value import evaluate_group
-from trackmdp.solvers.merging import Rule, make_rule
+from trackmdp.solvers.several.group_figures import GroupEvaluation
+from trackmdp.solvers.several.group_value import evaluate_group
+from trackmdp.solvers.several.merging import Rule, make_rule
 from trackmdp.solvers.solve import named_policy
 from trackmdp.world.group import Group, check_problem
-from trackmdp.world.model import Array, BoolArray
-from trackmdp.world.tracks import Problem
+from trackmdp.world.problem import Problem
 
 if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its sets
     from trackmdp.policies.policy import PolicyLike

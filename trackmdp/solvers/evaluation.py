@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.notebook.card import Card, Carded, Facts, decimal, percent
 from trackmdp.statistics import MeanInterval, ratio
-from trackmdp.world.model import Array, IndexArray
 
 
 @dataclass(frozen=True, repr=False)

@@ -22,10 +22,12 @@ from typing import TypeAlias
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays.entries import per_row
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers.bounds import one_set
-from trackmdp.solvers.linear import forced_worth, per_row
+from trackmdp.solvers.linear import forced_worth
 from trackmdp.solvers.plans import Layout, Plans, Turn
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import (
@@ -38,7 +40,7 @@ from trackmdp.solvers.search import (
     risen,
     shares,
 )
-from trackmdp.world.model import Array, BoolArray, IndexArray, World
+from trackmdp.world.model import World
 
 MOST_NUMBERS = 2**17
 """Numbers in one array of a part, 1 MB: larger parts leave the caches, and took twice the time."""

@@ -12,14 +12,15 @@ from collections.abc import Iterator
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays.entries import per_row, ranks
+from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation, pooled
-from trackmdp.solvers.linear import RenewalSystem, per_row
+from trackmdp.solvers.linear import RenewalSystem
 from trackmdp.solvers.walk import Events, Passed, Step, Walk, all_events, passed, transition
-from trackmdp.world.entries import ranks
-from trackmdp.world.model import Array, IndexArray, World
-from trackmdp.world.tracks import Problem, modelled
+from trackmdp.world.model import World
+from trackmdp.world.problem import Problem, modelled
 
 _MOST_CELLS = 144
 """Of a grid with false alarms: M² events."""

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from trackmdp.arrays.types import Array
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.compose import compose, default, given
 from trackmdp.config.sensors import LARGEST_PRICE
@@ -26,8 +27,8 @@ from trackmdp.solvers.solve import run_solver
 from trackmdp.solvers.tradeoff import ROUNDING, Corner, Tradeoff, height, slope, upper_hull
 from trackmdp.solvers.value import value_of
 from trackmdp.world.group import check_problem
-from trackmdp.world.model import Array, World
-from trackmdp.world.tracks import Problem, modelled
+from trackmdp.world.model import World
+from trackmdp.world.problem import Problem, modelled
 
 _LEAST = 1e-6
 """c / r beside price 0: there a sensor that brings nothing costs nothing, and may be on."""

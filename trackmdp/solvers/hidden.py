@@ -13,6 +13,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from trackmdp.arrays.types import BoolArray
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers import optimal
@@ -21,7 +22,7 @@ from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found, clocked_sets, follow_credit
 from trackmdp.solvers.solution import Solution
 from trackmdp.solvers.value import averaged_kernel, value_of
-from trackmdp.world.model import BoolArray, World
+from trackmdp.world.model import World
 
 _STEPS, _SWEEPS = 12, 1
 _MOST_EVENTS, _MOST_STARTS, _LEAST_STARTS = 6_000, 16, 1

@@ -17,9 +17,10 @@ from scipy.linalg.blas import daxpy
 from scipy.linalg.lapack import dgetrf, dgetrs
 from scipy.sparse.linalg import splu, spsolve_triangular
 
+from trackmdp.arrays.entries import short_indices, summing
+from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.errors import UserError
-from trackmdp.world.entries import short_indices, summing
-from trackmdp.world.model import Array, IndexArray, World
+from trackmdp.world.model import World
 
 DIRECT_CELLS = 20_000
 """Cells up to which systems are factorised. The factors of a grid fill about M^1.4 entries: 75 a cell at M = 16,384."""
@@ -344,11 +345,6 @@ def check_length(steps: Array) -> None:
     """Refuse expected steps that no kernel with an exit from each cell can have."""
     if (steps < 0).any() or (steps > _LONGEST_EPISODE).any():
         raise UserError(_ENDLESS)
-
-
-def per_row(rows: IndexArray, values: Array, count: int) -> Array:
-    """`[count]` sums of `values` over equal `rows`."""
-    return np.bincount(rows, weights=values, minlength=count).astype(np.float64, copy=False)
 
 
 def _factorised(system: sparse.csr_array, full: int = FULL) -> Callable[[Array, bool], Array]:

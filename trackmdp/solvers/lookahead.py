@@ -7,15 +7,16 @@ from typing import Literal, TypeAlias
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked_table, valid
-from trackmdp.solvers.branch import Tree
+from trackmdp.solvers.certify.branch import Tree
+from trackmdp.solvers.certify.inner import InnerProblem
+from trackmdp.solvers.certify.known import adopted, first_guess, tables, up_to
 from trackmdp.solvers.exchange import exchange
-from trackmdp.solvers.inner import InnerProblem
-from trackmdp.solvers.known import adopted, first_guess, tables, up_to
 from trackmdp.solvers.renewal import Renewal
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.model import World
 
 Tail: TypeAlias = Literal["qmdp", "clocked"]
 

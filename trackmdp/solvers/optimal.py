@@ -17,24 +17,25 @@ from functools import cached_property
 
 import numpy as np
 
+from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import exact_clocked_table, of_cells
-from trackmdp.solvers.branch import Tree
-from trackmdp.solvers.budget import Budget, Shares
+from trackmdp.solvers.certify.branch import Tree
+from trackmdp.solvers.certify.budget import Budget, Shares
+from trackmdp.solvers.certify.inner import InnerProblem
+from trackmdp.solvers.certify.known import adopted, planted
+from trackmdp.solvers.certify.listing import best_plans
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.exchange import best_of, exchanged, other_starts, revealed
-from trackmdp.solvers.inner import InnerProblem
-from trackmdp.solvers.known import adopted, planted
 from trackmdp.solvers.linear import RenewalSystem, expected_steps, forced_worth, grid_of
-from trackmdp.solvers.listing import best_plans
 from trackmdp.solvers.regions import improved, proved, region_side
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.rules import clocked_policy
 from trackmdp.solvers.search import Found, clocked_sets, follow_credit
 from trackmdp.solvers.solution import SearchProgress, Solution
 from trackmdp.solvers.value import value_of
-from trackmdp.world.model import Array, World
+from trackmdp.world.model import World
 
 ROUNDING = 1e-10
 """Relative gap that counts as rounding, at any tolerance."""

@@ -21,14 +21,15 @@ from typing import TypeAlias
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays.entries import row_index
+from trackmdp.arrays.types import BoolArray, IndexArray
 from trackmdp.config.by_blocks import PartitionConfig
 from trackmdp.errors import UserError
+from trackmdp.grid.displacements import apart, cell_at
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.workers import Crew, Made, in_turn
-from trackmdp.world.displacements import apart, cell_at
-from trackmdp.world.entries import row_index
-from trackmdp.world.model import BoolArray, IndexArray, World
+from trackmdp.world.model import World
 
 Planner: TypeAlias = "Callable[[int, World], PolicyTable]"
 """From a block's number and its world to its policy, by planning or by learning."""

@@ -18,9 +18,9 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from trackmdp.solvers.choose import Decisions
-from trackmdp.world.entries import summing
-from trackmdp.world.model import Array, BoolArray, IndexArray
+from trackmdp.arrays.entries import summing
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
+from trackmdp.sensing.choose import Decisions
 
 
 @dataclass(frozen=True, eq=False)

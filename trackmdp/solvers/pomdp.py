@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.errors import UserError
 from trackmdp.solvers.linear import accumulate
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.model import World
 
 DIGITS = 12
 """Beliefs that agree to this many digits are one."""

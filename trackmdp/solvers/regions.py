@@ -16,21 +16,22 @@ from functools import cached_property, partial
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.machine import free_bytes, gib, parse_bytes
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import rules
-from trackmdp.solvers.branch import Tree
+from trackmdp.solvers.certify.branch import Tree
+from trackmdp.solvers.certify.inner import InnerProblem
+from trackmdp.solvers.certify.known import adopted, planted
 from trackmdp.solvers.exchange import exchange, hopeful, revealed
-from trackmdp.solvers.inner import InnerProblem
-from trackmdp.solvers.known import adopted, planted
 from trackmdp.solvers.linear import DIRECT_CELLS, forced_worth
 from trackmdp.solvers.partition import Pairs, blocks, cells_of, end_to_end, reach, sub_world, within
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import candidates_of, columns_of
 from trackmdp.solvers.value import value_of
 from trackmdp.solvers.workers import Crew, Made, in_turn
-from trackmdp.world.model import Array, BoolArray, IndexArray, World
+from trackmdp.world.model import World
 
 ROOM, SMALLEST_SIDE, LARGEST_SIDE = 2**28, 32, 128
 """Bytes of a region, and its located cells in each direction, unless there is less memory. Wider ones have a smaller

@@ -13,18 +13,20 @@ from typing import TypeAlias, cast
 
 import numpy as np
 
+from trackmdp.arrays.entries import ones_at, per_row
+from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
 from trackmdp.machine import check_free
+from trackmdp.memory.keys import KeySpace
+from trackmdp.motion.chain import Motion
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers.choose import Decisions
-from trackmdp.solvers.linear import DIRECT_CELLS, TOLERANCE, RenewalSystem, per_row
+from trackmdp.sensing.choose import Decisions
+from trackmdp.sensing.decisions import sensing
+from trackmdp.sensing.task import Task
+from trackmdp.solvers.linear import DIRECT_CELLS, TOLERANCE, RenewalSystem
 from trackmdp.solvers.plans import Layout, Plans, Turn
-from trackmdp.solvers.sensing import sensing
 from trackmdp.solvers.value import event_system, first_events, solved, whole_renewals
 from trackmdp.solvers.walk import Events, Passed, Step, Walk, all_events, passed
-from trackmdp.world.entries import ones_at
-from trackmdp.world.memory import KeySpace
-from trackmdp.world.model import AnyArray, Array, BoolArray, IndexArray, Task, World
-from trackmdp.world.motion import Motion
+from trackmdp.world.model import World
 
 _DIRECT = 1_500
 """Cells up to which the systems of a search are factorised: above, the value before is so near that iterating is

@@ -12,13 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trackmdp.arrays.entries import per_row
+from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.policies.table import PolicyTable
+from trackmdp.sensing.choose import TIE
+from trackmdp.sensing.decisions import sensing
 from trackmdp.solvers.bounds import clocked_table
-from trackmdp.solvers.choose import TIE
-from trackmdp.solvers.linear import per_row
-from trackmdp.solvers.sensing import sensing
 from trackmdp.solvers.walk import Step, Walk, all_events
-from trackmdp.world.model import Array, IndexArray, World
+from trackmdp.world.model import World
 
 
 @dataclass(frozen=True)

@@ -16,13 +16,14 @@ from functools import cached_property
 
 import numpy as np
 
+from trackmdp.arrays.entries import per_row
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked_table
-from trackmdp.solvers.linear import per_row
 from trackmdp.solvers.plans import Plans
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.value import solved, visits_of
-from trackmdp.world.model import Array, BoolArray, IndexArray, World
+from trackmdp.world.model import World
 
 _ALONE = 16
 """Rows to try one by one where no larger part of the changes raises the AIHTR."""

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from trackmdp.arrays.types import Array
 from trackmdp.notebook.card import Card, Carded, decimal, grid_words
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.value import value_of
-from trackmdp.world.model import Array, World
+from trackmdp.world.model import World
 
 if TYPE_CHECKING:  # torch is loaded where a policy is to act
     from trackmdp.policies.policy import Policy

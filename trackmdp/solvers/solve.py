@@ -15,16 +15,16 @@ from trackmdp.config.compose import compose, default, given
 from trackmdp.config.registry import make, maker
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers.group_bounds import upper_bound
-from trackmdp.solvers.group_solution import GroupSolution
 from trackmdp.solvers.linear import DIRECT_CELLS
 from trackmdp.solvers.partition import blocks, narrow_halo, plan_by_blocks
 from trackmdp.solvers.regions import settled
+from trackmdp.solvers.several.group_bounds import upper_bound
+from trackmdp.solvers.several.group_solution import GroupSolution
 from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
 from trackmdp.solvers.workers import Crew, crew
 from trackmdp.world.group import Group, check_problem
 from trackmdp.world.model import World
-from trackmdp.world.tracks import Problem, modelled
+from trackmdp.world.problem import Problem, modelled
 
 if TYPE_CHECKING:  # torch is loaded where a policy is to act
     from trackmdp.policies.policy import Policy

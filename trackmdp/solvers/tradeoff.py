@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 
+from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, decimal, percent
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.solution import Solution
-from trackmdp.world.model import Array
 
 if TYPE_CHECKING:  # torch is loaded where a policy is to act
     from trackmdp.policies.policy import Policy

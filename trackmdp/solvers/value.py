@@ -17,8 +17,13 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays.entries import per_row, summing
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
+from trackmdp.motion.chain import Motion
 from trackmdp.policies.table import PolicyTable, SetTable
+from trackmdp.recordings.tracks import Recorded, Tracks
+from trackmdp.sensing.task import Task
 from trackmdp.solvers.evaluation import Evaluation, ReplayedTracks, by_start, pooled
 from trackmdp.solvers.linear import (
     DIRECT_CELLS,
@@ -27,15 +32,12 @@ from trackmdp.solvers.linear import (
     accumulate,
     check_length,
     expected_steps,
-    per_row,
     still_to_come,
     triangular,
 )
 from trackmdp.solvers.walk import Events, Passed, Walk, all_events, passed
-from trackmdp.world.entries import summing
-from trackmdp.world.model import Array, BoolArray, IndexArray, Task, World
-from trackmdp.world.motion import Motion
-from trackmdp.world.tracks import Problem, Recorded, Tracks
+from trackmdp.world.model import World
+from trackmdp.world.problem import Problem
 
 if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its sets
     from trackmdp.policies.policy import PolicyLike

@@ -24,10 +24,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.solvers.linear import per_row
-from trackmdp.world.memory import KeySpace
-from trackmdp.world.model import Array, BoolArray, IndexArray, Indices, Task
-from trackmdp.world.motion import Motion
+from trackmdp.arrays.entries import per_row
+from trackmdp.arrays.types import Array, BoolArray, IndexArray, Indices
+from trackmdp.memory.keys import KeySpace
+from trackmdp.motion.chain import Motion
+from trackmdp.sensing.task import Task
 
 FIGURES = ("reward", "steps", "detections", "sensors", "safe actions", "length")
 """Totals of an episode, in the order of the columns of `Passed.totals`; `steps` are those in the grid."""

@@ -38,8 +38,8 @@ from trackmdp.training.run import complete, load_run
 from trackmdp.training.trainer import Trainer
 from trackmdp.world.group import Subject, one_target
 from trackmdp.world.model import World
+from trackmdp.world.problem import modelled
 from trackmdp.world.problem_file import PROBLEM, problem_bytes
-from trackmdp.world.tracks import modelled
 
 
 def make_trainer(

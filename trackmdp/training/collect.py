@@ -14,12 +14,12 @@ from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, Mu
 from trackmdp.config import TrainConfig
 from trackmdp.config.learning import CollectorConfig, WorkersConfig
 from trackmdp.config.registry import maker
+from trackmdp.environment.env import TrackEnv
 from trackmdp.errors import RunError, message_of
 from trackmdp.imports import safe_children
 from trackmdp.seeding import seed_global
 from trackmdp.solvers.workers import end_with_parent
 from trackmdp.training.devices import make_device
-from trackmdp.world.env import TrackEnv
 from trackmdp.world.group import Subject
 
 MakeEnv: TypeAlias = "partial[TrackEnv]"

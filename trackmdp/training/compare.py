@@ -12,15 +12,16 @@ import numpy as np
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, decimal, percent
 from trackmdp.policies.policy import Policy, as_policy
+from trackmdp.recordings.tracks import Recorded
 from trackmdp.solvers.evaluate import group_rule
-from trackmdp.solvers.group_value import evaluate_group
-from trackmdp.solvers.merging import Rule
+from trackmdp.solvers.several.group_value import evaluate_group
+from trackmdp.solvers.several.merging import Rule
 from trackmdp.solvers.solve import named_policy
 from trackmdp.solvers.value import replay, value_of
 from trackmdp.statistics import MeanInterval, ratio
 from trackmdp.training.evaluator import estimated_qmdp
 from trackmdp.world.group import Group, Subject, check_problem
-from trackmdp.world.tracks import Problem, Recorded
+from trackmdp.world.problem import Problem
 
 FIGURES = ("aihtr", "accuracy", "sensors_per_step")
 Figures: TypeAlias = dict[str, MeanInterval]

@@ -15,7 +15,7 @@ from trackmdp.config import TrainConfig
 from trackmdp.config.options import Sizes, nodes
 from trackmdp.errors import UserError
 from trackmdp.machine import free_bytes, gib
-from trackmdp.world.model import Task
+from trackmdp.sensing.task import Task
 
 
 def make_device(name: str, key: str = "device") -> torch.device:

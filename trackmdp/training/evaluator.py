@@ -13,12 +13,14 @@ from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.estimates.path_plans import choose_plan
 from trackmdp.config.registry import choice_values
 from trackmdp.policies.table import PolicyTable
+from trackmdp.recordings.tracks import Recorded, Tracks
+from trackmdp.sensing.task import Task
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluation import Evaluation, ReplayedTracks, regret_per_step
 from trackmdp.solvers.hidden import averaged
 from trackmdp.solvers.value import replay, value_of
-from trackmdp.world.model import Task, World
-from trackmdp.world.tracks import Problem, Recorded, Tracks
+from trackmdp.world.model import World
+from trackmdp.world.problem import Problem
 
 ESTIMATED = "Q_MDP of the estimated kernel"
 """Q_MDP for the motion as the tracks to learn from show it."""

@@ -20,12 +20,12 @@ from trackmdp.seeding import derive, preserved_global_rng
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation, regret_per_step
-from trackmdp.solvers.group_bounds import upper_bound
-from trackmdp.solvers.group_figures import GroupEvaluation, with_ends
-from trackmdp.solvers.group_solution import GroupSolution
-from trackmdp.solvers.group_value import evaluate_group
-from trackmdp.solvers.joint_rule import JointRule
-from trackmdp.solvers.merging import Rule
+from trackmdp.solvers.several.group_bounds import upper_bound
+from trackmdp.solvers.several.group_figures import GroupEvaluation, with_ends
+from trackmdp.solvers.several.group_solution import GroupSolution
+from trackmdp.solvers.several.group_value import evaluate_group
+from trackmdp.solvers.several.joint_rule import JointRule
+from trackmdp.solvers.several.merging import Rule
 from trackmdp.solvers.solution import Solution
 from trackmdp.training.evaluator import Evaluator, Score, make_evaluator
 from trackmdp.world.group import Group, Subject

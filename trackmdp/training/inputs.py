@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from trackmdp.algos.estimates.alike import cell_classes
+from trackmdp.arrays.types import Array
 from trackmdp.config import TrainConfig
 from trackmdp.config.checks import own_paths
 from trackmdp.config.learning import file_of_classes
@@ -19,7 +20,6 @@ from trackmdp.config.tree import config_text
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.world.group import Group, Subject, learned_in
 from trackmdp.world.make import OF_TASK, make_problem
-from trackmdp.world.model import Array
 from trackmdp.world.problem_file import PROBLEM, problem_bytes, problem_digest, read_problem
 
 

@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 
 from trackmdp.config import TrainConfig
+from trackmdp.sensing.task import Task
 from trackmdp.world.group import Subject
-from trackmdp.world.model import Task
 
 FAR, _NEAR = 0.05, 0.01
 """Regret per step, in rewards of a detection, from which a policy counts as poor; of credit per sensor where more than

@@ -15,9 +15,9 @@ from torchrl.collectors.distributed import RayCollector
 
 from trackmdp.cluster import joining, ray_options
 from trackmdp.config.learning import RayWorkersConfig
+from trackmdp.environment.env import TrackEnv
 from trackmdp.errors import message_of, require
 from trackmdp.training.collect import MakeEnv, of_workers, own_env
-from trackmdp.world.env import TrackEnv
 
 _STORE = 2**30
 """Bytes for the batches on their way, of a cluster that is started here."""

@@ -17,6 +17,7 @@ import torch
 
 from trackmdp import __version__
 from trackmdp.algos.common import make_algorithm
+from trackmdp.arrays.types import Array
 from trackmdp.config import load_run_config
 from trackmdp.config.tree import config_digest
 from trackmdp.errors import UserError
@@ -37,8 +38,7 @@ from trackmdp.training.inputs import problem_of, with_own_classes
 from trackmdp.training.state import load_learned
 from trackmdp.untrusted import LARGE, decoded, read_text
 from trackmdp.world.group import Subject, group_of, one_target
-from trackmdp.world.model import Array
-from trackmdp.world.tracks import Problem
+from trackmdp.world.problem import Problem
 
 _PACKAGES = ("torch", "torchrl", "tensordict", "hydra-core", "numpy", "scipy")
 Metrics = dict[str, list[float | int | None]]

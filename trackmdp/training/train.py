@@ -17,6 +17,7 @@ from trackmdp.config import GROUPS, TrainConfig, options
 from trackmdp.config.compose import compose, default, given
 from trackmdp.config.logs import require_packages
 from trackmdp.config.resume import run_folder
+from trackmdp.environment.observation import ObservationVector
 from trackmdp.errors import UserError
 from trackmdp.seeding import preserved_global_rng
 from trackmdp.training.blocks import make_trainer
@@ -27,7 +28,6 @@ from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
 from trackmdp.untrusted import reason
 from trackmdp.world.group import Group, Subject, check_problem, learned_in
-from trackmdp.world.observation import ObservationVector
 
 
 def train(

@@ -1,1 +1,1 @@
-"""The target and the sensing grid."""
+"""Worlds: a task with the motion of its targets, from options, from files, one or several at once."""

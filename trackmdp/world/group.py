@@ -10,11 +10,14 @@ from typing import Any, TypeAlias
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays.types import Array, Indices
 from trackmdp.config.several import MOST_TARGETS
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, grid_words
-from trackmdp.world.model import Array, Indices, Task, World
-from trackmdp.world.tracks import Problem, Recorded, modelled
+from trackmdp.recordings.tracks import Recorded
+from trackmdp.sensing.task import Task
+from trackmdp.world.model import World
+from trackmdp.world.problem import Problem, modelled
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -138,6 +141,7 @@ class Group(Carded):
             inside = [mass @ world.kernel for mass, world in zip(inside, self.kinds, strict=True)]
             there = np.array([mass.sum() for mass in inside])[self.kind]
             each += float(there.sum())
+            # 1 - Π (1 - p) in logarithms: with p near 0 the product alone would lose all digits.
             left = float(-np.expm1(np.log1p(-np.minimum(there, 1.0 - 1e-16)).sum()))
         return total, each
 

@@ -12,20 +12,23 @@ from typing import Any, Literal, cast, overload
 import numpy as np
 import numpy.typing as npt
 
+from trackmdp.arrays.files import per_cell, read_matrix
+from trackmdp.arrays.numbers import PRICES, PROBABILITIES
 from trackmdp.config import WorldConfig
 from trackmdp.config.compose import compose, default, given
 from trackmdp.config.options import GROUPS, options
 from trackmdp.config.registry import make, maker
 from trackmdp.config.sensors import lattice
 from trackmdp.errors import UserError
-from trackmdp.world.coverage import Coverage, discs
-from trackmdp.world.files import per_cell, read_matrix
+from trackmdp.grid.place import Place
+from trackmdp.grid.size import TASK_BYTES, Size, check_fits, grid_size
+from trackmdp.motion.kernel_checks import canonical_kernel, check_kernel
+from trackmdp.recordings.track_files import read_track_file
+from trackmdp.recordings.tracks import Recorded
+from trackmdp.sensing.coverage import Coverage, discs
 from trackmdp.world.group import Group
-from trackmdp.world.kernel_checks import PRICES, PROBABILITIES, canonical_kernel, check_kernel
-from trackmdp.world.model import TASK_BYTES, Size, World, check_fits, grid_size
-from trackmdp.world.place import Place
-from trackmdp.world.track_files import read_track_file
-from trackmdp.world.tracks import Problem, Recorded, modelled
+from trackmdp.world.model import World
+from trackmdp.world.problem import Problem, modelled
 
 OF_TASK = {
     "size": "grid.size",
@@ -127,6 +130,7 @@ def make_world(
             "takes a table"
         )
     words = given({"kernel": kernel}) | _words(arguments)
+    # `compare` has all options of a world, and no solver or learner that could refuse one of them.
     if targets == 1:
         return modelled(make_problem(compose("compare", words)), f"kernel={kernel}")
     cfg = compose("solve", words | {"targets.count": targets})
@@ -211,7 +215,7 @@ def build_world(cfg: WorldConfig) -> World:
     """The world a config describes.
 
     Raises:
-        UserError: a file is missing or malformed, or the kernel breaks a rule (`kernel_checks.check_kernel`).
+        UserError: a file is missing or malformed, or the kernel breaks a rule (`motion/kernel_checks.py`).
     """
     (rows, columns), source, modes = cfg.grid.sides, cfg.kernel.source, {}
     own = {name: getattr(cfg.kernel, name) for name in options(type(cfg.kernel))}

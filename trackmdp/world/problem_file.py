@@ -23,14 +23,16 @@ from typing import Any, BinaryIO, TypeAlias
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays.files import csr_of, npz_bytes
+from trackmdp.arrays.types import AnyArray, IndexArray, Indices
 from trackmdp.errors import UserError
+from trackmdp.grid.place import Place, place_arrays, place_in
+from trackmdp.recordings.tracks import Recorded, Tracks
+from trackmdp.sensing.coverage import Coverage
 from trackmdp.untrusted import LARGE, decoded, load_npz, opened
-from trackmdp.world.coverage import Coverage
-from trackmdp.world.files import csr_of, npz_bytes
 from trackmdp.world.group import Group, Subject, group_of, one_target
-from trackmdp.world.model import AnyArray, IndexArray, Indices, World
-from trackmdp.world.place import Place, place_arrays, place_in
-from trackmdp.world.tracks import Problem, Recorded, Tracks
+from trackmdp.world.model import World
+from trackmdp.world.problem import Problem
 
 PROBLEM = "problem.npz"
 
@@ -105,6 +107,7 @@ def _group(given: dict[str, Any], members: Indices) -> Group:
     cells, kinds = math.prod(given["size"]), len(np.unique(members))
     if members.ndim != 1 or kernel.shape[0] != kinds * cells or members.max() != kinds - 1:
         raise ValueError(f"kinds {members.shape} of {kernel.shape[0]} states")
+    # A target keeps its motion, so that all moves are in the blocks on the diagonal.
     blocks = [slice(kind * cells, (kind + 1) * cells) for kind in range(kinds)]
     worlds = [World(kernel[block][:, block], **given) for block in blocks]
     return Group([worlds[kind] for kind in members])
@@ -162,6 +165,7 @@ def _whole(parts: Arrays) -> Any:
     """A sparse matrix, tracks, a place, or plain counts, whichever has parts of these names."""
     if "indptr" in parts:
         return csr_of(parts)
+    # Tracks of a recording without times have no `begins`.
     if parts.keys() | {"begins"} == _TRACKS:
         return Tracks(**parts)
     if "corner" in parts:

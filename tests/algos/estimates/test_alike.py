@@ -12,10 +12,10 @@ from scipy import sparse
 from trackmdp.algos.estimates.alike import AlikeCells, cell_classes
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.app.cli import main
+from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError
+from trackmdp.sensing.windows import Window
 from trackmdp.world.make import make_world
-from trackmdp.world.model import Array
-from trackmdp.world.windows import Window
 
 
 def counts_of(kernel: Array, moves: int, seed: int = 0) -> sparse.csr_array:

@@ -12,7 +12,7 @@ from scipy import sparse
 from trackmdp.algos.estimates import censored, kernel_estimate
 from trackmdp.algos.estimates.censored import ObservedPaths, expected_moves
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
-from trackmdp.world.model import Array
+from trackmdp.arrays.types import Array
 
 KERNEL = np.array(
     [[0.0, 0.5, 0.3, 0.0], [0.1, 0.0, 0.0, 0.8], [0.6, 0.0, 0.2, 0.1], [0.3, 0.3, 0.3, 0.0]]

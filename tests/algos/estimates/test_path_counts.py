@@ -14,10 +14,10 @@ from trackmdp.algos.estimates.path_counts import Planned, plan_paths
 from trackmdp.algos.estimates.path_gains import Paths
 from trackmdp.config.world import MEMORIES
 from trackmdp.policies.table import PolicyTable
+from trackmdp.recordings.tracks import Recorded, Tracks
+from trackmdp.sensing.task import Task
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.value import replay
-from trackmdp.world.model import Task
-from trackmdp.world.tracks import Recorded, Tracks
 
 SWEEP = (0, 1, 2, 5, 2, 1)
 """To and fro, the corner 0 to the middle 5 of the right side: from 1 and 2 the next cell depends on the direction."""

@@ -15,8 +15,8 @@ from trackmdp.algos.estimates.path_counts import KeyPlans, along, interleaved
 from trackmdp.algos.estimates.path_gains import AlongPaths, Paths, thinned
 from trackmdp.algos.estimates.path_plans import PRIORS, choose_plan, exchanged_keys, parted
 from trackmdp.policies.table import PolicyTable
+from trackmdp.recordings.tracks import Recorded, Tracks
 from trackmdp.solvers.value import replay
-from trackmdp.world.tracks import Recorded, Tracks
 
 
 def line_walks(seed: int, count: int = 12) -> Tracks:

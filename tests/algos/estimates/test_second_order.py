@@ -14,7 +14,7 @@ from trackmdp.algos.estimates.second_order import (
     headings,
     second_order,
 )
-from trackmdp.world.tracks import Tracks
+from trackmdp.recordings.tracks import Tracks
 
 TASK = tm.World(np.full((3, 3), 0.3), (1, 3), cost=0.16, t_max=1, memory="displacement")
 TRACKS = Tracks(

@@ -10,9 +10,9 @@ from scipy import sparse
 
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.estimates.shrinkage import least_worth_planning, posterior_mean, unseen, without
+from trackmdp.grid.displacements import apart
 from trackmdp.solvers import exchange, optimal
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.world.displacements import apart
 from trackmdp.world.make import make_world
 from trackmdp.world.model import World
 

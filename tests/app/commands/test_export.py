@@ -15,9 +15,9 @@ import torch
 import trackmdp as tm
 from tests.training.runs import train
 from trackmdp.app.cli import main
+from trackmdp.arrays.types import BoolArray
 from trackmdp.policies.saved import read_sets
 from trackmdp.training.run import trained
-from trackmdp.world.model import BoolArray
 
 INPUTS = """
 import sys, numpy as np

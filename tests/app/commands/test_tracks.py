@@ -21,11 +21,11 @@ from trackmdp.app.commands.train import run
 from trackmdp.config import GROUPS
 from trackmdp.config.compose import compose
 from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.recordings.tracks import Recorded, read_tracks, split
 from trackmdp.training.notices import poor
 from trackmdp.training.train import train as train_in_python
 from trackmdp.world.make import load_tracks
 from trackmdp.world.problem_file import PROBLEM, read_problem
-from trackmdp.world.tracks import Recorded, read_tracks, split
 
 TRACKS = drawn(small_world(exit_probability=0.05).kernel, 60)
 WORDS = [

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays.entries import per_row, row_index, with_data
+from trackmdp.arrays.files import read_numbers
+from trackmdp.arrays.types import BoolArray, IndexArray
 from trackmdp.errors import UserError
-from trackmdp.solvers.linear import per_row
-from trackmdp.world.displacements import displacement
-from trackmdp.world.entries import row_index, with_data
-from trackmdp.world.files import read_numbers
-from trackmdp.world.model import BoolArray, IndexArray
+from trackmdp.grid.displacements import displacement
 
 DEVIATIONS = 4.0
 """Standard deviations by which a test of homogeneity has to be exceeded for a group of cells to be split up."""

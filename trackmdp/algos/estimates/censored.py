@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from trackmdp.world.entries import row_index
-from trackmdp.world.model import Array, BoolArray, IndexArray
+from trackmdp.arrays.entries import row_index
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
 
 _AT_ONCE = 2**14
 """Paths with hidden cells that are drawn at once."""

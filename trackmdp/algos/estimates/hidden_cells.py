@@ -20,10 +20,11 @@ from trackmdp.algos.estimates.second_order import (
     headings,
     shift,
 )
-from trackmdp.world.displacements import cell_at
-from trackmdp.world.entries import among
-from trackmdp.world.model import Array, BoolArray, IndexArray, Task
-from trackmdp.world.tracks import Tracks
+from trackmdp.arrays.entries import among
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
+from trackmdp.grid.displacements import cell_at
+from trackmdp.recordings.tracks import Tracks
+from trackmdp.sensing.task import Task
 
 _SWEEPS = 20
 _MOST_MOVES = 50

@@ -18,10 +18,10 @@ from scipy import sparse
 from trackmdp.algos.estimates.alike import AlikeCells
 from trackmdp.algos.estimates.censored import ObservedPaths, counted, each_once, expected_moves
 from trackmdp.algos.estimates.shrinkage import posterior_mean, unseen
-from trackmdp.solvers.linear import per_row
-from trackmdp.world.displacements import apart, cell_at, displacement
-from trackmdp.world.entries import ones_at, row_index, with_data
-from trackmdp.world.model import Array, BoolArray, IndexArray, grid_size
+from trackmdp.arrays.entries import ones_at, per_row, row_index, with_data
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
+from trackmdp.grid.displacements import apart, cell_at, displacement
+from trackmdp.grid.size import grid_size
 
 _OPEN = 0.01
 """Weight, in the first round's kernel, of moves that were not seen yet."""

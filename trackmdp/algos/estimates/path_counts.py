@@ -16,13 +16,13 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.algos.estimates.path_gains import AlongPaths, Paths
+from trackmdp.arrays.entries import among, ones_at, per_row, summing
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
+from trackmdp.grid.displacements import apart, cell_at, displacement
+from trackmdp.memory.keys import KeySpace
 from trackmdp.policies.table import PolicyTable, SetTable
-from trackmdp.solvers.linear import per_row
-from trackmdp.solvers.sensing import sensing
-from trackmdp.world.displacements import apart, cell_at, displacement
-from trackmdp.world.entries import among, ones_at, summing
-from trackmdp.world.memory import KeySpace
-from trackmdp.world.model import Array, BoolArray, IndexArray, Task
+from trackmdp.sensing.decisions import sensing
+from trackmdp.sensing.task import Task
 
 _UNVISITED = 0.01
 """Weight of an event off the policy's own path: it shows the future after a rare key, but not as the policy itself

@@ -15,12 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.policies.table import SetTable
+from trackmdp.recordings.tracks import Tracks
+from trackmdp.sensing.task import Task
 from trackmdp.solvers.linear import triangular
 from trackmdp.solvers.renewal import Act, Renewal
 from trackmdp.solvers.walk import all_events
-from trackmdp.world.model import Array, BoolArray, IndexArray, Task
-from trackmdp.world.tracks import Tracks
 
 
 @dataclass(frozen=True)

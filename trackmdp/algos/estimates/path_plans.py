@@ -15,16 +15,16 @@ from scipy import sparse
 
 from trackmdp.algos.estimates.path_counts import KeyPlans, Planned, along, interleaved, plan_paths
 from trackmdp.algos.estimates.path_gains import AlongPaths, Paths, thinned
+from trackmdp.arrays.entries import ones_at, per_row, row_index
+from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.policies.table import PolicyTable
+from trackmdp.recordings.tracks import Tracks, shuffled
 from trackmdp.seeding import derive
+from trackmdp.sensing.decisions import sensing
+from trackmdp.sensing.task import Task
 from trackmdp.solvers.exchange import exchange
-from trackmdp.solvers.linear import per_row
 from trackmdp.solvers.plans import Layout, Plans, Turn
 from trackmdp.solvers.search import candidates_of, columns_of
-from trackmdp.solvers.sensing import sensing
-from trackmdp.world.entries import ones_at, row_index
-from trackmdp.world.model import Array, IndexArray, Task
-from trackmdp.world.tracks import Tracks, shuffled
 
 PRIORS = (1.0, 3.0, 10.0, 30.0, 100.0)
 """Weights of the prior mean that are tried."""

@@ -10,10 +10,12 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.algos.estimates.shrinkage import without
-from trackmdp.world.displacements import displacement
-from trackmdp.world.entries import ones_at, row_index
-from trackmdp.world.model import IndexArray, Task, World
-from trackmdp.world.tracks import Tracks
+from trackmdp.arrays.entries import ones_at, row_index
+from trackmdp.arrays.types import IndexArray
+from trackmdp.grid.displacements import displacement
+from trackmdp.recordings.tracks import Tracks
+from trackmdp.sensing.task import Task
+from trackmdp.world.model import World
 
 WEIGHT = 3.0
 """Moves as many as which the pooled motion of the cell counts in the motion after a cell and a move."""

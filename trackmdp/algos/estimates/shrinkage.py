@@ -25,9 +25,10 @@ import numpy as np
 from scipy import sparse
 from scipy.special import betaln
 
-from trackmdp.solvers.linear import per_row
-from trackmdp.world.entries import row_index, with_data
-from trackmdp.world.model import Array, IndexArray, Task, World
+from trackmdp.arrays.entries import per_row, row_index, with_data
+from trackmdp.arrays.types import Array, IndexArray
+from trackmdp.sensing.task import Task
+from trackmdp.world.model import World
 
 PRECISIONS = (30.0, 300.0, 3000.0)
 """a + b of the Beta(a, b) of the mixture: broad and narrow groups of probabilities."""

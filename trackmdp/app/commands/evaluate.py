@@ -33,13 +33,15 @@ from trackmdp.notebook.card import grid_words
 from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import sets_name, write_sets
+from trackmdp.recordings.gridding import said
+from trackmdp.recordings.tracks import Recorded
 from trackmdp.reports.held_out import recorded_page
 from trackmdp.solvers import bounds
 from trackmdp.solvers.evaluate import evaluate, group_rule
 from trackmdp.solvers.evaluation import figures
-from trackmdp.solvers.group_bounds import upper_bound
-from trackmdp.solvers.group_figures import with_ends
-from trackmdp.solvers.group_value import evaluate_group
+from trackmdp.solvers.several.group_bounds import upper_bound
+from trackmdp.solvers.several.group_figures import with_ends
+from trackmdp.solvers.several.group_value import evaluate_group
 from trackmdp.solvers.solve import baseline_policy
 from trackmdp.training.devices import make_device
 from trackmdp.training.display import make_console, show_held_out, table, with_interval
@@ -47,11 +49,10 @@ from trackmdp.training.evaluator import CELL_ALONE, ExactEvaluator, HeldOutEvalu
 from trackmdp.training.folders import SUMMARY, check_files, read_summary
 from trackmdp.training.group_run import FIGURES
 from trackmdp.training.run import trained
-from trackmdp.world.gridding import said
 from trackmdp.world.group import Group, Subject, group_of, one_target
 from trackmdp.world.make import false_alarm
 from trackmdp.world.model import World
-from trackmdp.world.tracks import Problem, Recorded, modelled
+from trackmdp.world.problem import Problem, modelled
 
 _FOR_THE_PICTURE = 16  # episodes simulated where none are asked for
 _FIGURES = {

@@ -14,7 +14,7 @@ from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.solvers.frontier import FrontierProgress, trace
 from trackmdp.solvers.tradeoff import Corner, Mixture, Tradeoff
 from trackmdp.training.display import make_console, reporting, table
-from trackmdp.world.tracks import Problem
+from trackmdp.world.problem import Problem
 
 _MOST_ROWS = 20
 """Corners shown at the terminal; the files have all."""

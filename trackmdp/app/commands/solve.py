@@ -25,7 +25,7 @@ from trackmdp.solvers.value import value_of
 from trackmdp.training.display import make_console, reporting, table
 from trackmdp.world.group import Group
 from trackmdp.world.model import World
-from trackmdp.world.tracks import Problem, modelled
+from trackmdp.world.problem import Problem, modelled
 
 _BOUNDS = {"paper": bounds.paper, "valid": bounds.valid, "clocked": bounds.clocked}
 

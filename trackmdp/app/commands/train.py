@@ -10,6 +10,7 @@ from rich.console import Console
 
 from trackmdp.config import TrainConfig
 from trackmdp.errors import RunError
+from trackmdp.recordings.gridding import said
 from trackmdp.training import notices
 from trackmdp.training.blocks import make_trainer
 from trackmdp.training.callbacks import Learning
@@ -19,7 +20,6 @@ from trackmdp.training.group_run import Several
 from trackmdp.training.inputs import problem_of
 from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
-from trackmdp.world.gridding import said
 from trackmdp.world.group import Subject
 
 

@@ -17,7 +17,7 @@ from trackmdp.paper.check import Check, summarize_checks
 from trackmdp.solvers import hidden, optimal
 from trackmdp.training.display import make_console
 from trackmdp.world.model import World
-from trackmdp.world.tracks import Problem, modelled
+from trackmdp.world.problem import Problem, modelled
 
 NODES = 10_000_000
 """Work for the optimum the theorems are about: two minutes or so."""

@@ -10,7 +10,7 @@ from scipy import sparse
 from tensordict import TensorDictBase
 
 from trackmdp.policies.policy import Policy
-from trackmdp.world.model import Task
+from trackmdp.sensing.task import Task
 
 if TYPE_CHECKING:
     from trackmdp_counts import CountsConfig

@@ -16,8 +16,8 @@ from stonesoup.types.prediction import StatePrediction
 from stonesoup.types.track import Track
 from stonesoup.types.update import StateUpdate
 
+from trackmdp.arrays.types import BoolArray
 from trackmdp.episodes.episode import Recording, last_cells
-from trackmdp.world.model import BoolArray
 from trackmdp_stone_soup.places import Places, ends_with_exit
 from trackmdp_stone_soup.sensors import PolicySensorManager
 

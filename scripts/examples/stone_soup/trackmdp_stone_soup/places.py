@@ -14,8 +14,8 @@ from stonesoup.types.state import State
 
 from trackmdp.episodes.episode import Episode
 from trackmdp.errors import UserError
-from trackmdp.world.model import Task
-from trackmdp.world.tracks import Tracks
+from trackmdp.recordings.tracks import Tracks
+from trackmdp.sensing.task import Task
 
 
 @dataclass(frozen=True)

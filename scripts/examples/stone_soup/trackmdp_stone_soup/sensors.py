@@ -21,8 +21,8 @@ from stonesoup.types.track import Track
 from stonesoup.types.update import Update
 
 from trackmdp import Policy
+from trackmdp.arrays.types import BoolArray
 from trackmdp.errors import UserError
-from trackmdp.world.model import BoolArray
 from trackmdp_stone_soup.places import Places
 
 

@@ -1,0 +1,148 @@
+"""The environment of several targets: its specs, its rules, and the values that the solvers give its policies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs.utils import check_env_specs
+
+import trackmdp as tm
+from trackmdp.environment.env import TrackEnv
+from trackmdp.errors import UserError
+from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.solve import solve
+from trackmdp.world.group import Group
+from trackmdp.world.model import World
+
+
+def two_kinds(**options: object) -> Group:
+    """A target that walks on 3 x 3 cells, and two that drift."""
+    given = {"size": 3, "exit_probability": 0.1, "t_max": 1, "cost": 0.2} | options
+    walks, drifts = (tm.make_world(name, **given) for name in ("random_walk", "drift"))  # type: ignore[call-overload]
+    return Group([walks, drifts, drifts])
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 2)])
+def test_specs_hold(batch: tuple[int, ...]) -> None:
+    env = TrackEnv(two_kinds(), batch)
+    check_env_specs(env)
+    shown = env.rollout(4, break_when_any_done=False)
+    assert shown["present"].shape == (*batch, 4, 3)
+    assert shown["action_history"].shape == (*batch, 4, 2, 9)
+    assert env.target.shape == (*batch, 3)
+
+
+def test_one_target_is_todays_environment() -> None:
+    world = tm.make_world(size=3, targets=1)
+    assert isinstance(world, World)
+    assert "present" not in TrackEnv(world, 2).observation_spec
+
+
+def test_a_step_is_rewarded_by_hand() -> None:
+    env = TrackEnv(two_kinds(safe_cost=1.5), 200, seed=3)
+    state, empty = env.reset(), torch.zeros(200, 9, dtype=torch.bool)
+    action = torch.rand(200, 9, generator=torch.Generator().manual_seed(0)) < 0.3
+    for step in range(3):
+        on = empty if step == 1 else action
+        before, forced = state, (state["steps_since_detection"] > 1).any(-1)
+        state = env.step(state.set("action", on))["next"]
+        inside = env.target < 9
+        seen = inside & (on.gather(1, env.target.clamp_max(8)) | forced[:, None])
+        paid = torch.where(forced, 1.5, 0.2 * on.sum(-1)) * inside.any(-1)
+        torch.testing.assert_close(state["reward"][:, 0], (seen.sum(-1) - paid).float())
+        n = torch.where(inside & ~seen, before["steps_since_detection"] + 1, 0)
+        torch.testing.assert_close(state["steps_since_detection"], n)
+        torch.testing.assert_close(state["present"], inside)
+        kept = on & ~forced[:, None]
+        torch.testing.assert_close(state["action_history"][:, 0], kept)
+        torch.testing.assert_close(state["terminated"][:, 0], ~inside.any(-1))
+        where = torch.where(seen, env.target.clamp_max(8), before["last_cell"])
+        torch.testing.assert_close(state["last_cell"], where)
+
+
+def test_union_earns_in_the_environment_what_the_joint_chain_says() -> None:
+    group = Group([tm.make_world("random_walk", size=3, exit_probability=0.2, t_max=0)] * 2)
+    found = solve(group)
+    exact = evaluate(group, found, merge="union")
+    assert exact.exact
+    table = torch.as_tensor(found.tables[0].dense()[:, 0])
+
+    def act(state: TensorDictBase) -> TensorDictBase:
+        wanted: Tensor = (state["steps_since_detection"] == 0) & state["present"]
+        return state.set("action", (table[state["last_cell"]] & wanted[..., None]).any(-2))
+
+    env = TrackEnv(group, 500, seed=1)
+    state, rewards, ends = env.reset(), torch.zeros(500, 1), 0
+    for _ in range(400):
+        shown, state = env.step_and_maybe_reset(act(state))
+        rewards += shown["next", "reward"]
+        ends += int(shown["next", "done"].sum())
+    # In the long run episodes follow each other, so that rewards per step are AIHTR / length.
+    each = rewards.numpy() / 400
+    error = each.std() / np.sqrt(len(each))
+    assert 400 * 500 / ends == pytest.approx(group.expected_steps, rel=0.02)
+    expected = exact.aihtr.mean / group.expected_steps
+    assert each.mean() == pytest.approx(expected, abs=4 * error)
+    assert error < 0.02 * abs(expected)
+
+
+def test_a_safe_action_that_misses_is_repeated() -> None:
+    env = TrackEnv(
+        two_kinds(safe_detection=0.4, safe_cost=1.5, exit_probability=0.01), 3000, seed=5
+    )
+    check_env_specs(env)
+    state, none = env.reset(), torch.zeros(3000, 9, dtype=torch.bool)
+    for step in range(4):
+        before, forced = state["steps_since_detection"], state["steps_since_detection"].amax(-1) > 1
+        state = env.step(state.set("action", none))["next"]
+        assert bool(forced.all()) == (step == 2)
+        n, inside = state["steps_since_detection"], state["present"]
+        missed = inside & (n > 0)
+        torch.testing.assert_close(n[missed], (before + 1).clamp_max(2)[missed])
+        paid = 1.5 * forced * inside.any(-1)
+        located = (inside & (n == 0)).sum(-1)
+        torch.testing.assert_close(state["reward"][:, 0], (located - paid).float())
+        found = located.sum() / inside.sum()
+        if step == 2:
+            assert abs(float(found) - 0.4) < 0.02
+        elif step < 2:
+            assert found == 0
+    # Where one clock of three stands at 2 all targets are looked for once more.
+    assert abs(float(forced.float().mean()) - (1 - 0.4**3)) < 0.02
+
+
+def test_episodes_are_cut_after_the_last_step_allowed() -> None:
+    env = TrackEnv(two_kinds(max_steps=3, exit_probability=0.3), 500, seed=1)
+    check_env_specs(env)
+    shown = env.rollout(3, break_when_any_done=False)["next"]
+    assert shown["step_count"].max() == 3
+    ended = shown["done"][:, :, 0].numpy()
+    truncated, left = shown["truncated"][:, :, 0], ~shown["present"].any(-1)
+    assert (truncated[:, :2].sum(), bool(truncated[:, 2].any())) == (0, True)
+    assert (shown["terminated"][:, :, 0] == left).all()
+    assert (ended == (truncated | left).numpy()).all()
+
+
+def test_a_snapshot_continues_with_the_same_draws() -> None:
+    env = TrackEnv(two_kinds(detection=0.7), 4)
+    env.rollout(5, break_when_any_done=False)
+    kept = env.snapshot()
+    action = torch.ones(4, 9, dtype=torch.bool)
+    first = env.step(env.restore(kept).set("action", action))
+    again = env.step(env.restore(kept).set("action", action))
+    assert (first == again).all()
+    with pytest.raises(UserError, match="snapshot: expected one of TrackEnv"):
+        TrackEnv(two_kinds(), 5).restore(kept)
+
+
+def test_what_several_targets_do_not_have_is_refused() -> None:
+    group = two_kinds(budget=1)
+    env = TrackEnv(group, 2)
+    assert int(env.rollout(9, break_when_any_done=False)["action"].sum(-1).max()) <= 1
+    with pytest.raises(UserError, match="render: 3 targets, expected a world of one"):
+        env.render()
+    with pytest.raises(UserError, match="5 sensors on, expected at most the budget, 1"):
+        env.step(env.reset().set("action", torch.arange(18).view(2, 9) % 2 == 0))

@@ -1,0 +1,1 @@
+"""Arrays and sparse matrices: their types, entries, checks and files."""

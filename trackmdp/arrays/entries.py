@@ -1,0 +1,76 @@
+"""Sparse matrices entry by entry: rows of entries, other numbers in the same places, matrices of ones."""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+Numbers: TypeAlias = npt.NDArray[np.integer[Any]]
+
+
+def row_index(matrix: sparse.csr_array) -> Numbers:
+    """`[nnz]` the row of each stored entry."""
+    # indptr = (0, 2, 2, 5) has rows of 2, 0 and 3 entries: 0 0 2 2 2. int64, so that row · M + cell never overflows.
+    return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+
+
+def with_data(matrix: sparse.csr_array, data: npt.NDArray[Any]) -> sparse.csr_array:
+    """The same entries with other numbers `[nnz]`; their places are shared, not copied."""
+    return sparse.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
+
+
+def short_indices(matrix: sparse.csr_array) -> sparse.csr_array:
+    """The same matrix with int32 indices, where they are enough: half the memory, and products read half as much.
+
+    SciPy takes the widest integer among a matrix's parts, so that one array of int64 spreads to all.
+    """
+    if max(*matrix.shape, matrix.nnz) > np.iinfo(np.int32).max:
+        return matrix
+    pointers = (each.astype(np.int32, copy=False) for each in (matrix.indices, matrix.indptr))
+    return sparse.csr_array((matrix.data, *pointers), shape=matrix.shape)
+
+
+def ones_at(
+    rows: Numbers, columns: Numbers, shape: tuple[int, int], kind: Any = np.bool_
+) -> sparse.csr_array:
+    """Ones in these places `[E]`, true or as numbers of a `kind`, of which those in one place are added up."""
+    return sparse.csr_array((np.ones(len(rows), dtype=kind), (rows, columns)), shape=shape)
+
+
+def summing(index: Numbers, count: int) -> sparse.csr_array:
+    """`[count, E]` 0/1 matrix that sums over the entries of each `index` `[E]`."""
+    return ones_at(index, np.arange(len(index)), (count, len(index)), np.float64)
+
+
+def per_row(rows: Numbers, values: npt.NDArray[np.float64], count: int) -> npt.NDArray[np.float64]:
+    """`[count]` sums of `values` over equal `rows`."""
+    return np.bincount(rows, weights=values, minlength=count).astype(np.float64, copy=False)
+
+
+def padded_rows(
+    matrix: sparse.csr_array, none: int = 0, *, more: int = 0
+) -> tuple[Numbers, npt.NDArray[np.float64]]:
+    """Columns and numbers of the entries of each row, `[R + more, Z]` each, Z >= 1; filled up with `none` and 0."""
+    rows, count = row_index(matrix), np.diff(matrix.indptr)
+    place = rows, np.arange(matrix.nnz) - matrix.indptr[rows]
+    columns = np.full((matrix.shape[0] + more, count.max(initial=1)), none)
+    numbers = np.zeros(columns.shape)
+    columns[place], numbers[place] = matrix.indices, matrix.data
+    return columns, numbers
+
+
+def ranks(rows: Numbers) -> Numbers:
+    """`[E]` the place of each entry in its row, of `rows` `[E]` in order: of 0 0 2 they are 0 1 0."""
+    return np.arange(len(rows)) - np.searchsorted(rows, rows)
+
+
+def among(known: Numbers, wanted: Numbers) -> tuple[Numbers, npt.NDArray[np.bool_]]:
+    """Where `wanted` numbers are among `known` ones, which are in order, and whether they are; in their shape."""
+    # With 37 and 41, 41 is at place 1, and so is 38, another number. The place of 50 would be 2: beyond the last.
+    place = np.minimum(np.searchsorted(known, wanted), max(len(known) - 1, 0))
+    if not len(known):
+        return place, np.zeros(place.shape, dtype=np.bool_)
+    return place, known[place] == wanted

@@ -1,0 +1,59 @@
+"""Checks of numbers per cell or sensor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from trackmdp.config.sensors import LARGEST_PRICE
+from trackmdp.errors import UserError
+
+Range: TypeAlias = tuple[Callable[[npt.NDArray[np.float64]], npt.NDArray[np.bool_]], str]
+"""A test of numbers, and its range in words."""
+
+PRICES: Range = (
+    lambda price: np.isnan(price) | ((price >= 0) & (price <= LARGEST_PRICE)),
+    "a number from 0 to 1e15, or nan where there is no sensor",
+)
+PROBABILITIES: Range = (lambda p: (p > 0) & (p <= 1), "a probability above 0, at most 1")
+
+
+def one_each(
+    source: str, given: npt.ArrayLike, count: int | tuple[int, int], each: str, allowed: Range
+) -> npt.NDArray[np.float64]:
+    """`[count]` numbers, from one for all or from one for each.
+
+    Args:
+        source: beginning of each message.
+        given: a number, or a list.
+        count: how many there are to be; of rows and columns their product, and the numbers may be `[rows, columns]`.
+        each: name of one item: a cell, or a sensor.
+        allowed: which of some numbers are in range, and the range in words.
+
+    Raises:
+        UserError: another number of numbers, or one out of range.
+    """
+    values = np.asarray(given, dtype=np.float64)
+    if isinstance(count, tuple):
+        values = values.ravel() if values.shape == count else values
+        count = math.prod(count)
+    if values.shape not in ((), (count,)):
+        found = f"{values.size} values" if values.ndim < 2 else f"an array {list(values.shape)}"
+        raise UserError(f"{source}: {found}, expected one number or {count} (one per {each})")
+    within, expected = allowed
+    if not (fine := np.asarray(within(values))).all():
+        bad = int(np.flatnonzero(~fine)[0])
+        raise UserError(f"{source}: {each} {bad} has {values.flat[bad]}, expected {expected}")
+    return np.broadcast_to(values, (count,)).copy()
+
+
+def whole_number(name: str, value: int, lowest: int, most: float = math.inf) -> int:
+    """A value that is an integer in its range; else a `UserError` with its name."""
+    if not isinstance(value, (int, np.integer)) or not lowest <= value <= most:
+        expected = f">= {lowest}" if most == math.inf else f"from {lowest} to {most:,}"
+        raise UserError(f"{name}={value}: expected an integer {expected}")
+    return int(value)

@@ -1,0 +1,1 @@
+"""The tracking environment of TorchRL and of Gymnasium."""

@@ -1,0 +1,1 @@
+"""The grid: its size, displacements between cells, and geography."""

@@ -1,0 +1,1 @@
+"""The memory of a policy: keys of past detections."""

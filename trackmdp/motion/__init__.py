@@ -1,0 +1,1 @@
+"""The motion of targets: kernels, hidden modes, and the chain of hidden states."""

@@ -1,0 +1,1 @@
+"""Recorded tracks, and positions that become tracks."""

@@ -1,0 +1,217 @@
+"""From recorded positions to tracks of cells: projected, sampled at a fixed step, cut at gaps and where they leave."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from trackmdp.arrays.entries import ranks
+from trackmdp.arrays.types import Array
+from trackmdp.errors import UserError
+from trackmdp.grid.place import Place, projected, projection
+from trackmdp.recordings.positions import Positions
+from trackmdp.recordings.tracks import Tracks, ends_of
+
+_WIDEST = 12.0
+"""Degrees of longitude that one UTM zone, six degrees wide, is stretched over at most."""
+
+
+_MOST = 2**27
+"""Steps of all tracks together; times in milliseconds and a step in seconds would make thousands for each report."""
+
+
+@dataclass(frozen=True)
+class Gridding:
+    """How positions become cells.
+
+    Attributes:
+        size: rows and columns of the grid; row 0 is the upper one, in the north.
+        cell: side of a cell, metres (of videos pixels).
+        step: time from one cell of a track to the next, seconds (of videos frames).
+        max_gap: longest time between two reports that is bridged, by a straight line; seconds.
+        shortest: fewest cells of a track.
+        exits: whether a target has left the grid at its last report.
+        origin: the corner of the grid with the smallest coordinates, in the file's coordinates; None: grid and
+            positions that are not held out have the same middle.
+        crs: projected coordinate system for degrees, such as ``EPSG:2056``; None: the UTM zone of their median.
+    """
+
+    size: tuple[int, int]
+    cell: float
+    step: float
+    max_gap: float
+    shortest: int
+    exits: bool
+    origin: tuple[float, float] | None = None
+    crs: str | None = None
+
+
+def to_tracks(
+    positions: Positions, grid: Gridding, source: str, held_out: np.ndarray
+) -> tuple[Tracks, dict[str, int], Place]:
+    """The tracks, the counts of reports read, cut or dropped, and the place of the grid.
+
+    A path is cut where no report came for longer than `max_gap`, and where it is outside of the grid. Its pieces are
+    tracks of the same name; one that ends by leaving the grid has an exit.
+
+    Args:
+        positions: of all targets.
+        grid: size, cells and steps of the tracks.
+        source: begins a message.
+        held_out: targets that have no say in where the grid lies, since nothing is learned from them.
+
+    Raises:
+        UserError: the projection does not fit the positions, or no track is left.
+    """
+    flat, place = _placed(positions, grid, source, ~np.isin(positions.track, held_out))
+    begin, x, y, last = _sampled(flat, grid)
+    cells = place.cells(x, y, grid.size)
+    tracks, counts = _cut(cells, begin, last, flat, grid)
+    gaps = int(_breaks(flat, grid).sum()) - len(np.unique(flat.track))
+    report = {
+        "reports read": positions.read,
+        "targets": len(np.unique(flat.track)),
+        **positions.dropped,
+        f"cuts where no report came for {grid.max_gap:g} or the file has a break": gaps,
+        "steps": len(cells),
+        **counts,
+    }
+    if not len(tracks):
+        raise UserError(f"{source}: no track of at least {grid.shortest} cells; {said(report)}")
+    return tracks, report, place
+
+
+def said(report: Mapping[str, int]) -> str:
+    """The report in one line, without the counts of 0."""
+    return ", ".join(f"{count:,} {what}" for what, count in report.items() if count)
+
+
+def _placed(
+    positions: Positions, grid: Gridding, source: str, says: np.ndarray
+) -> tuple[Positions, Place]:
+    """The positions in metres, and the place of the grid, which those in `says` `[P]` decide."""
+    code, flat = None, positions
+    if positions.geographic:
+        code = grid.crs or _utm(positions.x[says], positions.y[says], source)
+        x, y = map(np.asarray, projection(code).transform(positions.x, positions.y))
+        flat = replace(positions, x=x, y=y)  # inf where the projection does not reach
+    elif grid.crs is not None:
+        raise UserError(
+            f"{source}: has x and y, which are not projected; grid.crs={grid.crs} is for lat and lon"
+        )
+    corner = (
+        _middle(flat.x[says], flat.y[says], grid)
+        if grid.origin is None
+        else projected(code, grid.origin)
+    )
+    return flat, Place(corner, grid.cell, code, positions.downwards)
+
+
+def _utm(x: Array, y: Array, source: str) -> str:
+    """The code of the UTM zone in which the median position lies."""
+    low, high = np.percentile(x, (1, 99))
+    latitude = float(np.median(y))
+    if high - low > _WIDEST or abs(latitude) > 84:
+        raise UserError(
+            f"{source}: from {low:.1f} to {high:.1f} degrees of longitude, at latitude {latitude:.1f}, is no part of "
+            "one UTM zone; expected grid.crs, a projection in metres such as EPSG:6933 (world) or EPSG:3035 (Europe)"
+        )
+    # Zones of 6 degrees from 180 W on: 8.5 E is in 1 + floor(188.5 / 6) = 32. The code of the north serves the south
+    # too, where y is then negative: only differences count here.
+    zone = min(60, 1 + int((float(np.median(x)) + 180.0) // 6.0))
+
+    return f"EPSG:326{zone:02d}"
+
+
+def _breaks(positions: Positions, grid: Gridding) -> np.ndarray:
+    """`[P]` whether a report is the first of an uninterrupted path."""
+    first = np.ones(len(positions.time), dtype=bool)
+    # 1e-9: times since 1970 have errors of 1e-7 s, and a gap of exactly `max_gap` is bridged.
+    gap = np.diff(positions.time) > grid.max_gap * (1 + 1e-9) + 1e-6
+    first[1:] = (np.diff(positions.piece) != 0) | gap
+    return first
+
+
+def _sampled(positions: Positions, grid: Gridding) -> tuple[np.ndarray, Array, Array, np.ndarray]:
+    """Every path at its first report and each `step` after it, on the straight lines between reports.
+
+    Returns:
+        place: `[S]` for each sample the index of the first report of its path.
+        x, y: `[S]`.
+        last: `[S]` whether the path of the sample ends with the target's last report.
+    """
+    start = np.flatnonzero(_breaks(positions, grid))
+    end = np.concatenate([start[1:], [len(positions.time)]]) - 1
+    length = positions.time[end] - positions.time[start]
+    with np.errstate(over="ignore"):  # inf is too many, and refused as such
+        whole = np.floor(length / grid.step + 1e-6) + 1
+    if whole.sum() > _MOST:
+        raise UserError(
+            f"kernel.step={grid.step:g}: makes {whole.sum():.3g} steps of it, expected at most {_MOST:,}"
+        )
+    # All paths one after the other on one axis of time, for one call of interp. Example: reports at 7 9 | 3 5 8 with a
+    # pause of 1 between the paths stand at 0 2 | 3 5 8, and with a step of 2 are sampled at 0 2 | 3 5 7.
+    pause = np.concatenate([[0.0], np.cumsum(length + 1.0)[:-1]])
+    path = np.repeat(np.arange(len(start)), end - start + 1)
+    axis = positions.time - positions.time[start][path] + pause[path]
+    of = np.repeat(np.arange(len(start)), whole.astype(np.int64))
+    # Rounding must not carry the last sample into the pause, where the line leads to another target.
+    wanted = np.minimum(ranks(of) * grid.step, length[of]) + pause[of]
+    x, y = (np.interp(wanted, axis, column) for column in (positions.x, positions.y))
+    track = positions.track
+    final = np.append(track[1:] != track[:-1], True)[end]
+    return start[of], x, y, final[of]
+
+
+def _middle(x: Array, y: Array, grid: Gridding) -> tuple[float, float]:
+    """The smallest x and y of the grid, in metres, if grid and positions have the same middle."""
+    # Half way between the 1st and the 99th percentile: a few reports from nowhere do not move the grid.
+    known = [column[np.isfinite(column)] for column in (x, y)]
+    # Without one the grid may lie anywhere.
+    right, up = (
+        float(np.percentile(column, (1, 99)).mean()) if len(column) else 0.0 for column in known
+    )
+    rows, columns = grid.size
+    return right - columns * grid.cell / 2, up - rows * grid.cell / 2
+
+
+def _cut(
+    cells: np.ndarray, place: np.ndarray, last: np.ndarray, flat: Positions, grid: Gridding
+) -> tuple[Tracks, dict[str, int]]:
+    """The runs of cells inside the grid, of sufficient length."""
+    inside = cells >= 0
+    same = np.diff(place) == 0
+    # A run begins where the one before is of another path or outside, and ends likewise.
+    begins = np.flatnonzero(inside & ~np.concatenate([[False], same & inside[:-1]]))
+    ends = np.flatnonzero(inside & ~np.concatenate([same & inside[1:], [False]]))
+    # Left the grid: a further sample of the same path follows. Else it ends with the path: with an exit only where that
+    # is the last of the target and the recording does not just stop.
+    left = np.concatenate([same, [False]])[ends]
+    lengths = ends - begins + 1
+    kept = lengths >= grid.shortest
+    exits = (left | (last[ends] & grid.exits))[kept]
+    chosen = np.repeat(kept, lengths)
+    first = begins[kept]
+    # Steps since the first path that is kept, to the nearest one (another path may lie at any time, 10^300 s before);
+    # in its path a run begins some samples after the first.
+    within = first - np.searchsorted(place, place[first])
+    time = flat.time[place[first]]
+    clock = np.rint((time - time.min(initial=np.inf)) / grid.step).astype(np.int64)
+    made = Tracks(
+        cells[inside][chosen],
+        ends_of(lengths[kept]),
+        exits,
+        flat.track[place[first]],
+        clock + within,
+    )
+    counts = {
+        "steps outside of the grid": int((~inside).sum()),
+        f"steps in {int((~kept).sum()):,} tracks of fewer than {grid.shortest} cells": int(
+            lengths[~kept].sum()
+        ),
+        "steps kept": len(made.cells),
+        "tracks kept": len(made),
+    }
+    return made, counts

@@ -1,0 +1,215 @@
+"""Sensing, in one place: the sensors that may be on in one step, the entries that each sees, and the best set of them.
+
+An *entry* is a place where the target may be after the move of a step, of the plan of one row (a key, or a located
+cell); E of them. A *decision* is a pair (row, sensor); G of them. A set is a bool for each decision. With g_e the worth
+of seeing the target at entry e and b_e(A) the probability that set A reports it there, the best set of a row is
+
+    max over A  sum_e g_e b_e(A)  -  sum of the prices of A.
+
+Where one sensor decides each entry (`Own`: every sensor covers the cell of its number) the sum falls apart, and a
+sensor is on iff its gains exceed its price. Where sensors share cells (`Shared`) it is weighted coverage; see `cover`.
+
+All arrays are columns `[E, C]` and `[G, C]`: C candidates are worked on at once.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.arrays.entries import per_row, ranks, summing
+from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
+from trackmdp.sensing.task import Task
+
+TIE = 1e-12
+"""Relative slack of a threshold: gains equal to a price but for rounding count as equal to it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Decisions(ABC):
+    """Decisions of one step.
+
+    Attributes:
+        rows, sensors: `[G]`, row and sensor of each decision, in order.
+        count: K, rows.
+    """
+
+    rows: IndexArray
+    sensors: IndexArray
+    count: int
+
+    @property
+    def allowed(self) -> BoolArray | None:
+        """`[G, 1]`, the decisions that may be on; None: all."""
+        return None
+
+    @abstractmethod
+    def gained(self, gain: Array) -> Array:
+        """`[G, C]`, sums of `gain` `[E, C]` over the entries of each sensor, times its probability of a report."""
+
+    @abstractmethod
+    def part(self, kept: IndexArray, entries: IndexArray, rows: IndexArray) -> Decisions:
+        """Some of the decisions, on some of the entries.
+
+        Args:
+            kept: `[G']` decisions, all those of some rows.
+            entries: `[E']` entries of the same rows, in order.
+            rows: these rows, which become 0, 1, ...
+        """
+
+    @abstractmethod
+    def report(self, on: BoolArray) -> AnyArray:
+        """`[E, C]` probability that the set `on` `[G, C]` reports a target there; bool where no sensor misses."""
+
+    @abstractmethod
+    def best(
+        self, gain: Array, price: Array, on: BoolArray | None = None, *, exact: bool = False
+    ) -> BoolArray:
+        """`[G, C]` the set that gains most, where seeing each entry is worth `gain` `[E, C]`.
+
+        Args:
+            gain: of seeing a target there, weighted by its mass.
+            price: `[G, C]`, of each decision.
+            on: `[G, C]` a set that the one found is no worse than.
+            exact: whether shared sensors are chosen by linear and integer programs, not by greedy and add-drop.
+        """
+
+    @abstractmethod
+    def upper(self, gain: Array, price: Array) -> Array:
+        """`[K]`, proved: no set of a row gains more, of `gain` `[E]` and prices `[G]`."""
+
+    @abstractmethod
+    def margin(self, on: BoolArray, gain: Array, price: Array) -> Array:
+        """`[G]` distance of each decision from its threshold, relative to its price; inf where none can be."""
+
+
+def priced(decisions: Decisions, task: Task, inside: Array) -> Array:
+    """`[G, C]` expected prices: a sensor is paid with the probability `inside` `[K, C]` of the target in the grid."""
+    return task.prices[decisions.sensors, None] * inside[decisions.rows]
+
+
+def largest(rows: IndexArray, net: Array, count: int) -> BoolArray:
+    """`[G, C]`, the `count` decisions of each row with the largest `net` `[G, C]`, of equal ones the first."""
+    order = np.argsort(-net, axis=0, kind="stable")
+    by_row = np.argsort(rows[order], axis=0, kind="stable")
+    rank = np.empty(net.shape, dtype=np.int64)
+    ranked = np.take_along_axis(order, by_row, axis=0)
+    np.put_along_axis(rank, ranked, ranks(rows)[:, None], axis=0)
+    return rank < count
+
+
+@dataclass(frozen=True, eq=False)
+class Own(Decisions):
+    """Each entry is seen by the sensor of its own cell.
+
+    Two entries of one plan and one cell, with different modes, are decided together. Example: a target that may be in
+    cell 5 with heading 0 or 1, or in cell 6, has three entries, the decisions 0 0 1 and the sensors 5 6.
+
+    Attributes:
+        group: `[E]` the decision about each entry; None: entry e is decided by decision e.
+        chance: `[E, 1]` p_d there; None: 1 everywhere.
+        possible: `[G, 1]`, which sensors exist and lie in the window; None: all.
+        budget: sensors that may be on in a row; None: all.
+    """
+
+    group: IndexArray | None
+    chance: Array | None
+    possible: BoolArray | None
+    budget: int | None
+
+    @property
+    def allowed(self) -> BoolArray | None:
+        """See `Decisions`."""
+        return self.possible
+
+    @classmethod
+    def of(
+        cls,
+        task: Task,
+        rows: IndexArray,
+        cells: IndexArray,
+        count: int,
+        located: IndexArray | None,
+        *,
+        distinct: bool,
+    ) -> Own:
+        """See `sensing`."""
+        chance = None if task.perfect else task.detection[cells][:, None]
+        group = None
+        if not distinct:
+            codes = rows.astype(np.int64) * task.num_cells + cells
+            if not (np.diff(codes) > 0).all():
+                codes, group = np.unique(codes, return_inverse=True)
+                rows, cells = np.divmod(codes, task.num_cells)
+        allowed = task.choosable(None if located is None else located[rows], cells)
+        possible = None if allowed is None else allowed[:, None]
+        return cls(rows, cells, count, group, chance, possible, task.budget)
+
+    def within(self, on: BoolArray, net: Array) -> BoolArray:
+        """`[G, C]`, of the sets `on` as many sensors as the budget allows, those of the largest `net` `[G, C]`."""
+        assert self.budget is not None
+        return on & largest(self.rows, np.where(on, net, -np.inf), self.budget)
+
+    def report(self, on: BoolArray) -> AnyArray:
+        """See `Decisions`."""
+        there = on if self.group is None else on[self.group]
+        return there if self.chance is None else there * self.chance
+
+    def part(self, kept: IndexArray, entries: IndexArray, rows: IndexArray) -> Own:
+        """See `Decisions`."""
+        group = self.group
+        return Own(
+            np.searchsorted(rows, self.rows[kept]),
+            self.sensors[kept],
+            len(rows),
+            None if group is None else np.searchsorted(kept, group[entries]),
+            None if self.chance is None else self.chance[entries],
+            None if self.allowed is None else self.allowed[kept],
+            self.budget,
+        )
+
+    def gained(self, gain: Array) -> Array:
+        """See `Decisions`."""
+        gain = gain if self.chance is None else gain * self.chance
+        return gain if self.group is None else self._sums @ gain
+
+    @cached_property
+    def _sums(self) -> sparse.csr_array:
+        assert self.group is not None
+        return summing(self.group, len(self.rows))
+
+    def best(
+        self,
+        gain: Array,
+        price: Array,
+        on: BoolArray | None = None,  # noqa: ARG002
+        *,
+        exact: bool = False,  # noqa: ARG002
+    ) -> BoolArray:
+        """See `Decisions`."""
+        # Strict: an entry without mass is never sensed, not even by a sensor that costs nothing.
+        gained = self.gained(gain)
+        chosen: BoolArray = gained > price
+        chosen = chosen if self.allowed is None else chosen & self.allowed
+        return chosen if self.budget is None else self.within(chosen, gained - price)
+
+    def upper(self, gain: Array, price: Array) -> Array:
+        """See `Decisions`."""
+        net = np.maximum(self.gained(gain[:, None])[:, 0] - price, 0.0)
+        net = net if self.allowed is None else net * self.allowed[:, 0]
+        if self.budget is not None:
+            net = net * self.within((net > 0)[:, None], net[:, None])[:, 0]
+        return per_row(self.rows, net, self.count)
+
+    def margin(self, on: BoolArray, gain: Array, price: Array) -> Array:  # noqa: ARG002
+        """See `Decisions`."""
+        gained = self.gained(gain)
+        far = np.full_like(gained, np.inf)
+        # Free sensors come last: no price would make them nearly worth leaving out.
+        with np.errstate(over="ignore"):  # a price near the least of all numbers: far away
+            away = np.divide(np.abs(gained - price), price, out=far, where=price > 0)
+        return (away if self.allowed is None else np.where(self.allowed, away, np.inf))[:, 0]

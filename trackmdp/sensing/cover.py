@@ -1,0 +1,333 @@
+"""The best set of sensors that share cells: weighted coverage (theory.md#footprints).
+
+Sensor s reports a target at entry e with probability p_se, independently of the others. A set A is worth
+
+    sum_e g_e b_e(A) - sum_{s in A} c_s,      b_e(A) = 1 - prod_{s in A} (1 - p_se),
+
+g_e the worth of a report. Since b_e(A) <= min(z̄_e, sum_{s in A} p_se), z̄_e the value of b_e with all sensors on, the
+linear program
+
+    max  sum_e g_e z_e - sum_s c_s x_s      with  z_e <= sum_s p_se x_s,  0 <= z_e <= z̄_e,  0 <= x_s <= 1
+
+is worth no less than any set (and where no sensor misses, its integer solutions are the sets). Any lambda_e in [0, g_e]
+proves
+
+    sum_e z̄_e (g_e - lambda_e) + sum_s max(sum_e p_se lambda_e - c_s, 0)
+
+as an upper bound, for a solution of any solver: so the bounds here hold to rounding. Where g_e < 0, a report is a loss
+that a set has to take; the relaxation may leave it out (z_e = 0), which only raises the bound.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.arrays.entries import per_row, row_index, summing, with_data
+from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
+from trackmdp.errors import UserError
+from trackmdp.sensing.choose import TIE, Decisions
+from trackmdp.sensing.task import Task
+
+_PROVED = 1e-9
+"""Part of the possible gain up to which a set counts as the best: rounding of linear and integer programs."""
+_SCALE = 1e5
+"""The largest gain in an integer program."""
+_MOST = 2**26
+"""Sensors that see the entries of a step, entry by entry: some 5 GB."""
+_CERTAIN = 1.0 - 2.0**-53
+"""Stands for a probability of 1 where its logarithm is needed; all that is left of an entry then is 1e-16."""
+
+
+@dataclass(frozen=True)
+class Cover:
+    """Solutions of the linear programs of all rows.
+
+    Attributes:
+        on: `[G]`, share of each decision.
+        seen: `[E]`, share of each entry that is reported.
+        upper: `[K]`, proved: no set of the row gains more.
+    """
+
+    on: Array
+    seen: Array
+    upper: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Shared(Decisions):
+    """Decisions about sensors that share entries.
+
+    Attributes:
+        sees: `[G, E]` CSR, probability that the sensor of a decision reports an entry of its row.
+    """
+
+    sees: sparse.csr_array
+
+    @classmethod
+    def of(
+        cls,
+        task: Task,
+        rows: IndexArray,
+        cells: IndexArray,
+        count: int,
+        located: IndexArray | None,
+    ) -> Shared:
+        """See `trackmdp.sensing.decisions.sensing`.
+
+        Raises:
+            UserError: there are too many.
+        """
+        by_cell = task.sees_by_cell
+        if (total := int(np.diff(by_cell.indptr)[cells].sum())) > _MOST:
+            reach = f"{total:,} pairs of a cell where the target may be and a sensor that covers it"
+            raise UserError(
+                f"coverage: {reach}, expected at most {_MOST:,}; leave out sensors, or cells that they cover"
+            )
+        seen = by_cell[cells]
+        entry = row_index(seen)
+        row, sensor = rows[entry].astype(np.int64), seen.indices
+        keep = task.choosable(None if located is None else located[row], sensor)
+        data = seen.data
+        if keep is not None:
+            entry, row, sensor, data = entry[keep], row[keep], sensor[keep], data[keep]
+        # Of 9 sensors, the decision (row 2, sensor 5) has the number 2 * 9 + 5 = 23; sorted, they are the decisions.
+        numbers, number = np.unique(row * task.total_sensors + sensor, return_inverse=True)
+        owner, sensor = np.divmod(numbers, task.total_sensors)
+        sees = sparse.csr_array((data, (number, entry)), shape=(len(numbers), len(cells)))
+        return cls(owner, sensor, count, sees)
+
+    @cached_property
+    def perfect(self) -> bool:
+        """Whether no sensor misses in its footprint."""
+        return bool((self.sees.data == 1.0).all())
+
+    @cached_property
+    def _logs(self) -> sparse.csr_array:
+        """`[E, G]` log(1 - p)."""
+        return with_data(self.sees, np.log1p(-np.minimum(self.sees.data, _CERTAIN))).T.tocsr()
+
+    @cached_property
+    def _odds(self) -> sparse.csr_array:
+        """`[G, E]` p / (1 - p): factor of the unreported mass that a sensor adds to the reports."""
+        p = np.minimum(self.sees.data, _CERTAIN)
+        return with_data(self.sees, self.sees.data / (1.0 - p))
+
+    def _unreported(self, on: AnyArray) -> Array:
+        """`[E, C]` probability that no sensor of `on` `[G, C]` reports an entry."""
+        return np.exp(self._logs @ on.astype(np.float64))
+
+    def report(self, on: BoolArray) -> AnyArray:
+        """See `Decisions`."""
+        if self.perfect:
+            return self.sees.T @ on.astype(np.float64) > 0
+        left = self._unreported(on)
+        return np.where(left < 1e-15, 1.0, 1.0 - left)
+
+    def gained(self, gain: Array) -> Array:
+        """See `Decisions`."""
+        return self.sees @ gain
+
+    def worth(self, on: BoolArray, gain: Array, price: Array) -> Array:
+        """`[K, C]` net gain of the sets `on`; each entry's gain is shared by the sensors that may report it."""
+        times = np.maximum(self.sees.T @ on.astype(np.float64), 1e-300)
+        parts = on * (self.sees @ (gain * self.report(on) / times))
+        return self._sums @ (parts - on * price)
+
+    @cached_property
+    def _sums(self) -> sparse.csr_array:
+        return summing(self.rows, self.count)
+
+    def changes(self, on: BoolArray, gain: Array, price: Array) -> Array:
+        """`[G, C]` gain of switching each sensor over, all others as they are."""
+        left = gain * self._unreported(on)
+        return np.where(on, price - self._odds @ left, self.sees @ left - price)
+
+    def upper(self, gain: Array, price: Array) -> Array:
+        """See `Decisions`; by integer programs where no sensor misses."""
+        return self.cover(gain, price, exact=True).upper
+
+    def margin(self, on: BoolArray, gain: Array, price: Array) -> Array:
+        """See `Decisions`."""
+        change = np.abs(self.changes(on, gain, price))
+        far = np.full_like(change, np.inf)
+        return np.divide(change, price, out=far, where=price > 0)[:, 0]
+
+    def best(
+        self, gain: Array, price: Array, on: BoolArray | None = None, *, exact: bool = False
+    ) -> BoolArray:
+        """See `Decisions`; found by adding and dropping one sensor at a time, from `on`, from none and from all."""
+        price = np.broadcast_to(price, (len(self.rows), gain.shape[1]))
+        if exact:
+            columns = zip(gain.T, price.T, strict=True)
+            return np.stack([self.cover(*each, exact=True).on > 0 for each in columns], axis=1)
+        found = self.greedy(gain, price)
+        if on is None:
+            return found
+        start = np.broadcast_to(on, np.broadcast_shapes(on.shape, price.shape))
+        return self._better(self._add_drop(start, gain, price), found, gain, price)
+
+    def greedy(self, gain: Array, price: Array) -> BoolArray:
+        """`[G, C]` a good set of each row: the better one of the ends of add-drop from none and from all.
+
+        Of sensors that report the same entries alike the cheapest takes part.
+        """
+        kept = self.distinct(price[:, 0])
+        if len(kept) < len(price):
+            on = np.zeros(price.shape, dtype=bool)
+            on[kept] = self.some(kept).greedy(gain, price[kept])
+            return on
+        none = self._add_drop(np.zeros(price.shape, dtype=bool), gain, price)
+        every = self._add_drop(self.sees @ np.maximum(gain, 0.0) > price, gain, price)
+        return self._better(none, every, gain, price)
+
+    def _better(self, one: BoolArray, other: BoolArray, gain: Array, price: Array) -> BoolArray:
+        """Of each row the set that gains more, the first where they gain the same."""
+        better = self.worth(other, gain, price) > self.worth(one, gain, price)
+        return np.where(better[self.rows], other, one)
+
+    def _add_drop(self, on: BoolArray, gain: Array, price: Array) -> BoolArray:
+        """Every row takes the one change that gains it most, until none gains."""
+        tie = TIE * float(np.abs(gain).max(initial=0.0) + price.max(initial=0.0))
+        first = np.flatnonzero(np.diff(self.rows, prepend=-1))
+        lengths = np.diff(first, append=len(self.rows))
+        on, place = on.copy(), np.arange(len(self.rows))[:, None]
+        while len(first):
+            change = self.changes(on, gain, price)
+            best = np.maximum.reduceat(change, first, axis=0)
+            tied = np.where(change >= np.repeat(best, lengths, axis=0), place, len(place))
+            chosen = np.minimum.reduceat(tied, first, axis=0)  # of several equal ones the first
+            row, column = np.nonzero(best > tie)
+            if not len(row):
+                break
+            where = chosen[row, column], column
+            on[where] = ~on[where]
+        return on
+
+    def distinct(self, price: Array) -> IndexArray:
+        """The cheapest of the decisions that report the same entries alike; no best set needs another."""
+        if not self.perfect:  # two sensors at one place see more than one
+            return np.arange(len(self.rows))
+        order = np.lexsort((price, self._kind))
+        return np.sort(order[np.diff(self._kind[order], prepend=-1) > 0])
+
+    def some(self, kept: IndexArray) -> Shared:
+        """Some of the decisions, on all entries."""
+        return Shared(self.rows[kept], self.sensors[kept], self.count, self.sees[kept])
+
+    def part(self, kept: IndexArray, entries: IndexArray, rows: IndexArray) -> Shared:
+        """See `Decisions`."""
+        place = np.searchsorted(rows, self.rows[kept])
+        sees = self.sees[kept][:, entries]
+        return Shared(place, self.sensors[kept], len(rows), sees)
+
+    @cached_property
+    def _kind(self) -> IndexArray:
+        """`[G]`, one number for all decisions that see the same entries, 0 ... without gaps."""
+        (count, entries), start = self.sees.shape, self.sees.indptr[:-1]
+        length, kind = np.diff(self.sees.indptr), np.zeros(count, dtype=np.int64)
+        for place in range(int(length.max(initial=0))):
+            # Decisions alike up to here differ by their next entry; `entries` stands for none.
+            entry = np.full(count, entries, dtype=np.int64)
+            entry[length > place] = self.sees.indices[start[length > place] + place]
+            kind = np.unique(kind * (entries + 1) + entry, return_inverse=True)[1]
+        return kind
+
+    def cover(self, gain: Array, price: Array, *, exact: bool = False) -> Cover:
+        """The linear program of each row, of gains `[E]` and prices `[G]`; sets alone where `exact`.
+
+        All rows make one program, which falls apart into theirs; `exact` solves those with fractions, few if any, as
+        integer programs. With sensors that miss their sets are good ones, and only the bound is proved.
+        """
+        # A sensor is in no solution if all its entries together gain no more than its price.
+        use = self.distinct(price)
+        use = use[self.sees[use] @ np.maximum(gain, 0.0) > price[use]]
+        reached = np.bincount(self.sees[use].indices, minlength=len(gain)) > 0
+        entries = np.flatnonzero(reached & (gain > 0))
+        sees, cost, value = self.sees[use][:, entries], price[use], gain[entries]
+        on, upper, most = np.zeros(len(price)), np.zeros(self.count), np.ones(len(entries))
+        if len(use):
+            if not self.perfect:
+                most -= self.some(use)._unreported(np.ones((len(use), 1), dtype=bool))[entries, 0]
+            on[use], worth = _relaxed(sees, value, cost, most)
+            # The bound of the module's text: of the entries, and of the sensors.
+            owner = np.zeros(len(entries), dtype=np.int64)
+            pairs = sees.tocoo()
+            owner[pairs.col] = self.rows[use][pairs.row]
+            upper = per_row(owner, most * (value - worth), self.count)
+            upper += per_row(self.rows[use], np.maximum(sees @ worth - cost, 0.0), self.count)
+        if exact:
+            sets, upper = self._rounded(on, gain, price, upper)
+            seen = self.report(sets[:, None])[:, 0]
+            return Cover(sets.astype(np.float64), seen.astype(np.float64), upper)
+        whole = np.ones(len(gain))
+        whole[entries] = most
+        return Cover(on, np.minimum(on @ self.sees, whole) * (gain > 0), upper)
+
+    def _rounded(
+        self, on: Array, gain: Array, price: Array, upper: Array
+    ) -> tuple[BoolArray, Array]:
+        """Sets `[G]`, and their proved bound `[K]`: those of the linear program, or else of integer programs."""
+        column, paid = gain[:, None], price[:, None]
+        sets = self._better(on[:, None] > 0.5, self.greedy(column, paid), column, paid)
+        other, upper = sets.copy(), upper.copy()
+        left = upper - self.worth(sets, column, paid)[:, 0]
+        kept = self.distinct(price)
+        if self.perfect:
+            for row in np.flatnonzero(left > _PROVED * np.maximum(upper, 1e-3)):
+                mine = kept[self.rows[kept] == row]
+                other[mine, 0], proved = _integer(self.sees[mine], gain, price[mine])
+                upper[row] = min(upper[row], proved)
+        return self._better(sets, other, column, paid)[:, 0], upper
+
+
+def _relaxed(sees: sparse.csr_array, gain: Array, price: Array, most: Array) -> tuple[Array, Array]:
+    """Shares `[G]` of the linear program, and lambda `[E]` in [0, gain]: the price of each entry's being reported."""
+    from scipy.optimize import linprog  # a tenth of a second to load
+
+    p, e = sees.shape
+    # Minimise price x - gain z; z_e - (sees^T x)_e <= 0.
+    constraint = sparse.hstack([-sees.T, sparse.eye_array(e)], format="csr")
+    found = linprog(
+        np.concatenate([price, -gain]),
+        A_ub=constraint,
+        b_ub=np.zeros(e),
+        bounds=np.stack([np.zeros(p + e), np.concatenate([np.ones(p), most])], axis=1),
+        method="highs",
+    )
+    if found.status != 0:  # never seen; all on and no prices is a bound as well
+        return np.ones(p), np.zeros(e)
+    return np.clip(found.x[:p], 0.0, 1.0), np.clip(-found.ineqlin.marginals, 0.0, gain)
+
+
+def _integer(sees: sparse.csr_array, gain: Array, price: Array) -> tuple[BoolArray, float]:
+    """The best set `[G]` of one row, where no sensor misses, and its proved bound."""
+    from scipy.optimize import Bounds, LinearConstraint, milp  # as above
+
+    used = np.flatnonzero(np.diff(sees.tocsc().indptr))
+    sees, gain = sees[:, used], gain[used]
+    p, e = sees.shape
+    # z_e = 1 iff some sensor of e is on: z_e <= sum of x_s; and x_s <= z_e, which binds where seeing e is a loss.
+    pairs = sees.tocoo()
+    loss = gain[pairs.col] < 0
+    sensor, entry = pairs.row[loss], pairs.col[loss]
+    count = np.arange(len(sensor))
+    signs = np.repeat([1.0, -1.0], len(count))
+    place = (np.tile(count, 2), np.concatenate([sensor, p + entry]))
+    forced = sparse.csr_array((signs, place), shape=(len(count), p + e))
+    union = sparse.hstack([-sees.T, sparse.eye_array(e)], format="csr")
+    # HiGHS stops once the best set and its bound are within 1e-6: of numbers this much larger that is nothing.
+    scale = _SCALE / max(float(gain.max(initial=0.0)), 1e-300)
+    found = milp(
+        scale * np.concatenate([price, -gain]),
+        constraints=LinearConstraint(sparse.vstack([union, forced], format="csr"), ub=0.0),
+        integrality=np.concatenate([np.ones(p), np.zeros(e)]),
+        bounds=Bounds(0, 1),
+        options={"mip_rel_gap": 0.0},
+    )
+    if found.x is None:
+        return np.zeros(p, dtype=bool), np.inf
+    return found.x[:p] > 0.5, float(-found.mip_dual_bound) / scale * (1.0 + _PROVED)

@@ -1,0 +1,1 @@
+"""Proofs of optimality: branch and bound, and the listing of all plans."""

@@ -1,0 +1,101 @@
+"""The search for the target from each located cell, the worth of locating it given: the problem that trees prove.
+
+Its keys are the cells, and the state of the target is its cell: branch and bound decides cell by cell.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
+from trackmdp.sensing.decisions import sensing
+from trackmdp.solvers.linear import forced_worth
+from trackmdp.solvers.plans import Layout, Plans, Turn
+from trackmdp.solvers.renewal import Renewal
+from trackmdp.solvers.search import candidates_of, columns_of
+from trackmdp.world.model import World
+
+
+@dataclass(frozen=True, eq=False)
+class InnerProblem:
+    """Some sets to be chosen, one after the other, from each located cell.
+
+    Attributes:
+        renewal: the events, which are the located cells, and their steps.
+        detected: `[M]`, worth of locating the target in each cell, r + V.
+        missed: `[M]`, worth of the target in each cell, undetected after the last set.
+        length: H, sets to be chosen.
+        first: misses before the first of them.
+        windowed: whether the task's window limits the sets; not where a known position stands for any located cell.
+    """
+
+    renewal: Renewal
+    detected: Array
+    missed: Array
+    length: int
+    first: int = 0
+    windowed: bool = True
+
+    @classmethod
+    def of(cls, renewal: Renewal, value: Array) -> InnerProblem:
+        """The problem of one renewal: after the last set comes the safe action. `value`: `[M]`, V."""
+        world = renewal.world
+        detected = world.reward + value
+        return cls(renewal, detected, forced_worth(world, detected), world.num_choices)
+
+    @property
+    def world(self) -> World:
+        """The problem."""
+        return self.renewal.world
+
+    @property
+    def states(self) -> IndexArray:
+        """`[E]`, the cells of the entries before the first move."""
+        renewal = self.renewal
+        if self.first:
+            return renewal.steps[self.first - 1].states
+        return renewal.states[: len(renewal.plans)]
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Entries and decisions."""
+        whole = self.renewal.layout
+        turns = whole.turns[self.first : self.first + self.length]
+        if not self.windowed and self.world.window is not None:
+            steps = self.renewal.steps[self.first : self.first + self.length]
+            turns = [
+                Turn(turn.rows, turn.moves, turn.stay, choice, self.world.prices[choice.sensors])
+                for turn, step in zip(turns, steps, strict=True)
+                for choice in [sensing(self.world, step.rows, step.states, whole.count)]
+            ]
+        return Layout(whole.rows[self.first], turns, whole.count)
+
+    def plans(self, mass: Array | None = None, credit: list[Array] | None = None) -> Plans:
+        """The plans.
+
+        Args:
+            mass: `[E]`, undetected mass before the first move; None: 1 in each located cell.
+            credit: for each set `[M]`, optimistic gain of locating the target in a cell over missing it.
+        """
+        renewal, layout = self.renewal, self.layout
+        steps = renewal.steps[self.first : self.first + self.length]
+        detected = [self.detected[step.states] for step in steps]
+        if credit is not None:
+            credit = [each[step.states] for each, step in zip(credit, steps, strict=True)]
+        weight = np.ones(len(layout.rows[0])) if mass is None else mass
+        return Plans(layout, weight, detected, self.missed[steps[-1].states], credit)
+
+    def worth(self, sets: list[BoolArray], mass: Array | None = None) -> Array:
+        """`[M]`, worth of the plans `sets` `[G]` from each located cell."""
+        return self.plans(mass).worth(candidates_of(sets))[:, 0]
+
+    def guess(self, credit: list[Array], mass: Array | None = None) -> list[BoolArray]:
+        """Sets found by a homotopy from `credit` to the exact credit; see `search`."""
+        plans = self.plans(mass, credit)
+        sets = plans.none()
+        for optimism in np.linspace(1.0, 0.0, 11):
+            sets = plans.ascend(sets, sweeps=3, optimism=float(optimism))
+        return columns_of(sets)

@@ -1,0 +1,263 @@
+"""The best plans by listing all sets but the last, which is then a choice of its own (theory.md#proof-of-optimality).
+
+Given the sets before it, the last set of a plan is a best answer (`choose`). So a row's best plan is found by going
+through the sets before: the subsets of the sensors in reach, one bit for each, or with a budget the small ones. Where
+sensors share cells only the cells covered by the first set matter: of all sets that cover the same ones the cheapest
+counts, and there are 2^Z such subsets of the Z successors.
+
+Most choices need not be followed: with the state revealed after the listed sets they would be worth less than the plan
+at hand.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain, combinations
+from typing import TypeAlias
+
+import numpy as np
+
+from trackmdp.arrays.entries import ranks
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
+from trackmdp.sensing.choose import Own
+from trackmdp.sensing.cover import Shared
+from trackmdp.solvers.plans import Plans
+
+_MOST_BITS = 14
+"""Sensors of a row in all sets but the last up to which all choices are listed; with a budget 2^14 choices."""
+_MOST_PATTERNS = 2**22
+"""Sets of cells covered, of all rows: 32 MB of prices."""
+
+
+@dataclass(frozen=True)
+class Listed:
+    """The outcome of a listing.
+
+    Attributes:
+        most: `[K]`, proved: no plan is worth more.
+        sets: `[G]` for each step, the plans at hand or better ones.
+    """
+
+    most: Array
+    sets: list[BoolArray]
+
+
+def best_plans(
+    plans: Plans, sets: list[BoolArray], slack: float, revealed: Array, go_on: Callable[[int], bool]
+) -> Listed | None:
+    """All plans of all rows.
+
+    Args:
+        plans: with mass 1 in each row.
+        sets: `[G]` for each step, the plans at hand.
+        slack: plans better by less are not looked for.
+        revealed: `[E]`, after the last but one step: worth of one more set with the state known.
+        go_on: takes the number of plans looked at since it was asked last; whether to go on.
+
+    Returns:
+        None where there are too many choices, or `go_on` ended the listing.
+    """
+    first = _choices(plans)
+    if first is None:
+        return None
+    worth = plans.worth([on[:, None] for on in sets])[:, 0]
+    most, best = worth + slack, np.full(len(worth), -1)
+    for number in range(first.count):
+        tried = first.of(number)
+        earned, mass = _earned(plans, tried)
+        hopeful = earned + plans.layout.sums(plans.length - 1) @ (mass * revealed) > most
+        if not hopeful.any():
+            continue
+        if not go_on(int(hopeful.sum())):
+            return None
+        reached = earned + _last(plans, mass, hopeful)
+        better = hopeful & (reached > most)
+        most, best = np.where(better, reached, most), np.where(better, number, best)
+    return Listed(most, _plans_of(plans, sets, first, best))
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """A choice of all listed sets: reports `[E]` of each step, and prices `[K]` relative to the mass in the grid."""
+
+    report: list[Array]
+    price: list[Array]
+
+
+@dataclass(frozen=True)
+class _Choices:
+    """All choices of the listed sets.
+
+    Attributes:
+        count: of them.
+        of: the choice of a number.
+        sets: from the number of each row `[K]`, -1 for none, to the sets `[G]` of each listed step.
+    """
+
+    count: int
+    of: Callable[[int], _Tried]
+    sets: Callable[[IndexArray], list[BoolArray]]
+
+
+def _choices(plans: Plans) -> _Choices | None:
+    turns = plans.turns[:-1]
+    choices = [turn.choice for turn in turns]
+    if not turns:
+        return _Choices(1, lambda _: _Tried([], []), lambda _: [])
+    if all(isinstance(choice, Own) for choice in choices):
+        return _of_sensors(plans)
+    first = choices[0]
+    return _of_patterns(plans, first) if isinstance(first, Shared) and len(turns) == 1 else None
+
+
+def _of_sensors(plans: Plans) -> _Choices | None:
+    """The sets of all steps but the last as bits, of which each sensor of a row has its own."""
+    owners = [turn.choice.rows for turn in plans.turns[:-1]]
+    numbers = list(map(ranks, owners))
+    choice = plans.turns[0].choice
+    assert isinstance(choice, Own)
+    few = choice.budget is not None
+    found = _small_sets(numbers, choice.budget or 0) if few else _all_sets(owners, numbers)
+    if found is None:
+        return None
+    count, bits = found
+
+    def sets(numbers: IndexArray) -> list[BoolArray]:
+        found = []
+        for t, turn in enumerate(plans.turns[:-1]):
+            on = bits(t, numbers[turn.choice.rows]) & 1 > 0
+            allowed = turn.choice.allowed
+            found.append(on if allowed is None else on & allowed[:, 0])
+        return found
+
+    def of(number: int) -> _Tried:
+        report, price = [], []
+        for t, on in enumerate(sets(np.full(plans.layout.count, number)), start=1):
+            report.append(plans.turns[t - 1].choice.report(on[:, None])[:, 0])
+            price.append(plans.layout.pay(t) @ on)
+        return _Tried(report, price)
+
+    return _Choices(count, of, sets)
+
+
+_Bits: TypeAlias = Callable[[int, IndexArray], IndexArray]
+"""From a step and `[G]` numbers of choices to `[G]`; the last bit is whether the sensor of a decision is on."""
+
+
+def _all_sets(
+    owners: Sequence[IndexArray], places: Sequence[IndexArray]
+) -> tuple[int, _Bits] | None:
+    """A bit for each sensor of a row, those of later steps after those of earlier ones."""
+    shifts, before = [], np.zeros(max(int(owner.max(initial=-1)) for owner in owners) + 1, np.int64)
+    for owner, place in zip(owners, places, strict=True):
+        shifts.append(before[owner] + place)
+        before += np.bincount(owner, minlength=len(before))
+    bits = int(before.max(initial=0))
+    return (2**bits, lambda t, number: number >> shifts[t]) if bits <= _MOST_BITS else None
+
+
+def _small_sets(places: Sequence[IndexArray], budget: int) -> tuple[int, _Bits] | None:
+    """All combinations of sets of at most `budget` sensors, the first step's changing fastest."""
+    widths = [int(place.max(initial=-1)) + 1 for place in places]
+    counts = [sum(math.comb(width, k) for k in range(budget + 1)) for width in widths]
+    if math.prod(counts) > 2**_MOST_BITS or max(widths) > 62:
+        return None
+    tables = [
+        np.array([sum(1 << sensor for sensor in some) for some in _subsets(width, budget)])
+        for width in widths
+    ]
+    turns = np.cumprod([1, *counts])
+
+    def bits(t: int, number: IndexArray) -> IndexArray:
+        return tables[t][number // turns[t] % counts[t]] >> places[t]
+
+    return math.prod(counts), bits
+
+
+def _subsets(width: int, most: int) -> Iterator[tuple[int, ...]]:
+    """The subsets of 0 ... width - 1 with at most so many elements."""
+    return chain.from_iterable(combinations(range(width), k) for k in range(most + 1))
+
+
+def _of_patterns(plans: Plans, choice: Shared) -> _Choices | None:
+    """A bit for each entry of a row at the only listed step, seen by the cheapest set that sees no others."""
+    turn = plans.turns[0]
+    number = ranks(turn.rows)
+    bits = int(number.max(initial=0)) + 1
+    if not choice.perfect or plans.layout.count << bits > _MOST_PATTERNS:
+        return None
+    kept = choice.distinct(turn.price)
+    cheapest = _cheapest(choice.some(kept), turn.price[kept], number, 2**bits)
+
+    def of(pattern: int) -> _Tried:
+        return _Tried([((pattern >> number) & 1).astype(np.float64)], [cheapest[:, pattern]])
+
+    def sets(numbers: IndexArray) -> list[BoolArray]:
+        # The cheapest set that sees a pattern: seeing an entry of it is worth more than all prices, any other a loss as
+        # large.
+        of_entry = numbers[turn.rows]
+        wanted = (of_entry >> number) & 1 > 0
+        large = (1.0 + turn.price.sum()) * (of_entry >= 0)
+        on: BoolArray = choice.cover(np.where(wanted, large, -large), turn.price, exact=True).on > 0
+        return [on]
+
+    return _Choices(2**bits, of, sets)
+
+
+def _cheapest(choice: Shared, price: Array, number: IndexArray, patterns: int) -> Array:
+    """`[K, 2^Z]`, the least price of a set that sees the entries of each pattern and no others; inf without one.
+
+    Bit b of a pattern: the entry of a row with the `number` b is seen.
+    """
+    pattern = (choice.sees @ (1 << number)).astype(np.int64)
+    place = ranks(choice.rows)
+    every, cheapest = np.arange(patterns), np.full((choice.count, patterns), np.inf)
+    cheapest[:, 0] = 0.0
+    for k in range(int(place.max(initial=-1)) + 1):
+        pair = np.flatnonzero(place == k)
+        row = choice.rows[pair][:, None]
+        # With sensor k, patterns become their union with its own; each of the patterns before has one place to go.
+        reached = cheapest[row[:, 0]] + price[pair][:, None]
+        np.minimum.at(cheapest, (row, every | pattern[pair][:, None]), reached)
+    return cheapest
+
+
+def _earned(plans: Plans, tried: _Tried) -> tuple[Array, Array]:
+    """`[K]` reward of the listed sets, and `[E]` the mass that they leave undetected."""
+    earned, mass = np.zeros(plans.layout.count), plans.mass[:, 0]
+    for t, (report, price) in enumerate(zip(tried.report, tried.price, strict=True), start=1):
+        now = plans.turns[t - 1].back @ mass
+        sums = plans.layout.sums(t)
+        inside = sums @ now
+        paid = np.where(inside > 0, price, 0.0) * inside  # an impossible set costs inf
+        earned += sums @ (now * report * plans.detected[t - 1][:, 0]) - paid
+        mass = now * (1.0 - report)
+    return earned, mass
+
+
+def _last(plans: Plans, mass: Array, hopeful: BoolArray) -> Array:
+    """`[K]` the most that the best last set earns from `mass` `[E]`, of the rows that are `hopeful`."""
+    turn, t = plans.turns[-1], plans.length
+    now = turn.back @ (mass * hopeful[plans.layout.rows[t - 1]])
+    missed = plans.missed[:, 0]
+    gain = now * (plans.detected[t - 1][:, 0] - missed)
+    price = plans.priced(t, now[:, None])[:, 0]
+    most: Array = plans.layout.sums(t) @ (now * missed)
+    return most + turn.choice.upper(gain, price)
+
+
+def _plans_of(
+    plans: Plans, sets: list[BoolArray], first: _Choices, best: IndexArray
+) -> list[BoolArray]:
+    """The plans of the best choices, in the rows that have one."""
+    new = [on[:, None] for on in first.sets(best)]
+    for old, on, turn in zip(sets, new, plans.turns, strict=False):
+        on[:, 0] = np.where(best[turn.choice.rows] >= 0, on[:, 0], old)
+    turn, t = plans.turns[-1], plans.length
+    now = plans.pushed(new, t)
+    gain = now * (plans.detected[t - 1] - plans.missed)
+    last = turn.choice.best(gain, plans.priced(t, now), sets[-1][:, None], exact=True)
+    better = best[turn.choice.rows] >= 0
+    return [*(on[:, 0] for on in new), np.where(better, last[:, 0], sets[-1])]

@@ -1,0 +1,149 @@
+"""Joint information states of several targets, one by one: exact where they are few (tiny worlds)."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.arrays.types import Array, IndexArray
+from trackmdp.solvers.linear import summed_over
+from trackmdp.solvers.several.merging import Beliefs, Clocks, Rule
+from trackmdp.world.group import Group
+
+MOST_STATES = 2_000
+"""Joint states up to which a policy is valued exactly: a second or two."""
+
+Known: TypeAlias = tuple[int, int, tuple[tuple[int, float], ...]]
+"""A target in the grid: state of the last detection, misses since, and its belief as pairs of state and mass."""
+Joint: TypeAlias = tuple[Known | None, ...]
+"""What is known of every target; None of one that has left."""
+Outcome: TypeAlias = tuple[float, bool, Known | None]
+"""Probability, whether it is a detection, and what is known then."""
+
+
+@dataclass(frozen=True)
+class Chain:
+    """All joint states that choices lead to, and their choices.
+
+    Attributes:
+        states: number of joint states; the first `starts` are those with all targets located.
+        starts: of them.
+        owner: `[C]`, joint state of each choice.
+        totals: `[C, 6]`, expected figures of the step (`GroupEvaluation.totals`).
+        moves: `[C, states]`, probability of each joint state after it.
+    """
+
+    states: int
+    starts: int
+    owner: IndexArray
+    totals: Array
+    moves: sparse.csr_array
+
+
+def joint_chain(rule: Rule, most: int = MOST_STATES) -> Array | None:
+    """`[1, 6]` exact expected totals of a policy from a uniform start.
+
+    None where there are more joint states, or the policy remembers more than beliefs.
+    """
+    group = rule.group
+    if group.task.num_cells ** len(group) > most or rule.reads_history:
+        return None
+
+    def choices(joint: Joint) -> list[IndexArray]:
+        row = [(k, *pair) for k, known in enumerate(joint) if known for pair in known[2]]
+        beliefs = Beliefs(*(np.array(part) for part in zip(*row, strict=True)))
+        shown = [known or (0, 0, ()) for known in joint]
+        located, misses = (np.array([[each[part] for each in shown]]) for part in (0, 1))
+        present = np.array([[known is not None for known in joint]])
+        return [rule.sets(Clocks(located, misses, present), beliefs.moved(group))]
+
+    chain = explored(group, choices, most)
+    if chain is None:
+        return None
+    if group.task.max_steps is None:
+        system = sparse.eye_array(chain.states, format="csc") - chain.moves
+        found = sparse.linalg.spsolve(sparse.csc_array(system), chain.totals)
+    else:
+        found = summed_over(chain.moves, chain.totals, group.task.max_steps)
+    return np.asarray(found[: chain.starts].mean(axis=0, keepdims=True))
+
+
+def explored(group: Group, choices: Callable[[Joint], list[IndexArray]], most: int) -> Chain | None:
+    """The joint states reached from all starts; None where there are more than `most`.
+
+    Args:
+        group: the targets.
+        choices: sets of sensors, of which each is followed.
+        most: states.
+    """
+    cells, kinds = group.task.num_cells, group.kind
+    starts = itertools.product(*(range(kind * cells, (kind + 1) * cells) for kind in kinds))
+    joint: list[Joint] = [tuple((z, 0, ((z, 1.0),)) for z in each) for each in starts]
+    number, first = {each: place for place, each in enumerate(joint)}, len(joint)
+    owner, totals, entries = list[int](), list[Array](), list[tuple[int, int, float]]()
+    for place in itertools.count():
+        if place == len(joint):
+            break
+        forced = any(each and each[1] > group.task.t_max for each in joint[place])
+        for on in [np.arange(0)] if forced else choices(joint[place]):
+            row, total = len(owner), np.zeros(6)
+            for chance, after, figures in _steps(group, joint[place], set(on.tolist()), forced):
+                total += chance * figures
+                if any(after):
+                    if after not in number:
+                        number[after] = len(joint)
+                        joint.append(after)
+                    entries.append((row, number[after], chance))
+            owner.append(place)
+            totals.append(total)
+        if len(joint) > most:
+            return None
+    rows, columns, chances = (np.array(part) for part in zip(*entries, strict=True))
+    moves = sparse.csr_array((chances, (rows, columns)), shape=(len(owner), len(joint)))
+    return Chain(len(joint), first, np.array(owner), np.array(totals), moves)
+
+
+def _steps(
+    group: Group, joint: Joint, on: set[int], forced: bool
+) -> Iterator[tuple[float, Joint, Array]]:
+    """Probability, joint state after it and figures of every outcome of a step."""
+    task = group.task
+    price = task.safe_cost if forced else float(task.paid[list(on)].sum())
+    each = [[(1.0, False, None)] if not k else _outcomes(group, k, on, forced) for k in joint]
+    for outcome in itertools.product(*each):
+        chance = float(np.prod([part[0] for part in outcome]))
+        found, after = sum(part[1] for part in outcome), tuple(part[2] for part in outcome)
+        inside = sum(part is not None for part in after)
+        paid = inside > 0
+        reward = task.reward * found - price * paid
+        chosen = 0 if forced else len(on)
+        yield chance, after, np.array([reward, inside, found, chosen * paid, forced and paid, 1.0])
+
+
+def _outcomes(group: Group, known: Known, on: set[int], forced: bool) -> list[Outcome]:
+    """What a step may lead to for one target: located in a state, missed, or gone."""
+    task, (located, misses, belief) = group.task, known
+    states, masses = (np.array(part) for part in zip(*belief, strict=True))
+    moved = Beliefs(np.zeros(len(states), np.int64), states, masses).moved(group)
+    cells = moved.state % task.num_cells
+    sees = np.array([cell in on for cell in cells]) * task.detection[cells]
+    sees = task.safe_detection[cells] if forced else sees
+    found: list[Outcome] = [
+        (float(p), True, (int(z), 0, ((int(z), 1.0),)))
+        for p, z in zip(moved.mass * sees, moved.state, strict=True)
+        if p > 0
+    ]
+    left = moved.mass * (1.0 - sees)
+    if (total := float(left.sum())) > 1e-15:
+        # Rounded, so that the same belief reached in two ways is one state.
+        pairs = [
+            (int(z), round(p / total, 12)) for z, p in zip(moved.state, left, strict=True) if p > 0
+        ]
+        found.append((total, False, (located, min(misses + 1, task.t_max + 1), tuple(pairs))))
+    gone = 1.0 - float(moved.mass.sum())
+    return [*found, (gone, False, None)] if gone > 1e-15 else found

@@ -1,0 +1,124 @@
+"""The figures of a policy for several targets, exact or with intervals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from trackmdp.arrays.types import Array
+from trackmdp.notebook.card import Card, Carded, decimal
+from trackmdp.statistics import MeanInterval, ratio
+
+_HALF = 1.96
+"""Of a 95 % interval, in standard errors; there are many episodes."""
+
+
+@dataclass(frozen=True, repr=False)
+class GroupEvaluation(Carded):
+    """Figures of a policy for several targets.
+
+    Attributes:
+        totals: `[E, 7]` of simulated episodes: reward, steps of targets in the grid, detections, sensors on by choice,
+            safe actions, steps of the episode, reward of single targets that are always known (`known_rewards`); or
+            one row of exact expectations of the first six. On recorded tracks a row for each group of held-out tracks.
+        exact: whether they are exact.
+        expected_length: steps until the last target has left, exact; on recorded tracks the mean.
+        controls: exact means of the second and of the last column; None on recorded tracks, which have none.
+    """
+
+    totals: Array
+    exact: bool
+    expected_length: float
+    controls: tuple[float, float] | None
+
+    def _ratio(self, part: int, whole: int) -> MeanInterval:
+        if self.exact:
+            value = float(self.totals[0, part] / self.totals[0, whole])
+            return MeanInterval(value, value, value, 1)
+        return ratio(self.totals[:, part], self.totals[:, whole])
+
+    @cached_property
+    def aihtr(self) -> MeanInterval:
+        """Expected reward of an episode.
+
+        Most of its variance is that of two figures of the motion alone, whose means are known: it is taken out by
+        least squares (control variates).
+        """
+        count, reward = len(self.totals), self.totals[:, 0]
+        if self.exact:
+            return MeanInterval(float(reward[0]), float(reward[0]), float(reward[0]), 1)
+        if self.controls is None:
+            return ratio(reward, np.ones(count))
+        columns = self.totals[:, [1, 6]] - self.totals[:, [1, 6]].mean(axis=0)
+        slope = np.linalg.lstsq(columns, reward, rcond=None)[0]
+        mean = float((reward - (self.totals[:, [1, 6]] - self.controls) @ slope).mean())
+        rest = reward - reward.mean() - columns @ slope
+        half = _HALF * math.sqrt(float((rest**2).sum()) / max(count - 3, 1) / count)
+        return MeanInterval(mean, mean - half, mean + half, count)
+
+    @property
+    def reward_per_step(self) -> MeanInterval:
+        """Reward per step of an episode, the last exit step included."""
+        if self.controls is None:
+            return self._ratio(0, 5)
+        return _times(self.aihtr, 1.0 / self.expected_length)
+
+    @property
+    def accuracy(self) -> MeanInterval:
+        """Detections per step of a target in the grid."""
+        return self._ratio(2, 1)
+
+    @property
+    def sensors_per_step(self) -> MeanInterval:
+        """Sensors on by choice per step."""
+        return self._ratio(3, 5)
+
+    @property
+    def safe_per_step(self) -> MeanInterval:
+        """Safe actions per step."""
+        return self._ratio(4, 5)
+
+    def less(self, other: GroupEvaluation) -> GroupEvaluation:
+        """The differences of all totals to those of another policy for the same targets."""
+        controls = None
+        if self.controls and other.controls:
+            mine, theirs = self.controls, other.controls
+            controls = mine[0] - theirs[0], mine[1] - theirs[1]
+        totals = self.totals - other.totals
+        return GroupEvaluation(totals, self.exact, self.expected_length, controls)
+
+    @property
+    def about(self) -> str:
+        """What the figures are means over."""
+        if self.exact:
+            return "exact"
+        kind = "simulated episodes" if self.controls else "groups of held-out tracks"
+        return f"{len(self.totals):,} {kind}, 95 %"
+
+    def card(self) -> Card:
+        """The figures with their intervals."""
+        names = ("aihtr", "reward_per_step", "accuracy", "sensors_per_step", "safe_per_step")
+        facts = {name.replace("_", " "): with_ends(getattr(self, name)) for name in names}
+        facts["steps per episode"] = decimal(self.expected_length, 1)
+        return Card(
+            f"Evaluation of several targets: {self.about}", {"AIHTR": facts.pop("aihtr")} | facts
+        )
+
+
+def _times(found: MeanInterval, factor: float) -> MeanInterval:
+    low, high = (None if end is None else end * factor for end in (found.low, found.high))
+    return MeanInterval(found.mean * factor, low, high, found.n)
+
+
+def with_ends(found: MeanInterval) -> str:
+    """A figure and its interval."""
+    if found.low is None or found.high is None or found.low == found.high:
+        return decimal(found.mean, 4)
+    above, below = found.high - found.mean, found.mean - found.low
+    if abs(above - below) > 0.1 * (above + below):
+        ends = f"{decimal(found.low, 4)} to {decimal(found.high, 4)}"
+        return f"{decimal(found.mean, 4)} ({ends})"
+    return f"{decimal(found.mean, 4)} ± {decimal(above, 4)}"

@@ -1,0 +1,74 @@
+"""Solving for several targets: the plans of single targets, merged, and a bracket around the best policy of all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from trackmdp.notebook.card import Card, Carded, decimal, grid_words
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.several.group_bounds import sensors_suffice
+from trackmdp.solvers.several.group_tracker import GroupTracker
+from trackmdp.solvers.several.merging import Merged
+from trackmdp.solvers.solution import Solution
+from trackmdp.world.group import Group
+
+
+@dataclass(frozen=True, repr=False)
+class GroupSolution(Carded):
+    """Plans for several targets.
+
+    Attributes:
+        group: the targets.
+        singles: the solution of a single target, for each of `group.kinds`.
+        upper: proved: no policy has a higher AIHTR.
+        seconds: time spent.
+    """
+
+    group: Group
+    singles: tuple[Solution, ...]
+    upper: float
+    seconds: float
+
+    @property
+    def tables(self) -> tuple[PolicyTable, ...]:
+        """The policies of single targets."""
+        return tuple(each.table for each in self.singles)
+
+    @cached_property
+    def policy(self) -> Merged:
+        """The policy that adds up the gains of all targets."""
+        return Merged(self.group, self.tables)
+
+    def tracker(self, cells: Sequence[int]) -> GroupTracker:
+        """A tracker that follows targets located in `cells`, one for each, with `policy`."""
+        return GroupTracker(self.policy, cells)
+
+    @property
+    def apart(self) -> float:
+        """AIHTR of as many separate trackers, each with sensors of its own."""
+        return float(sum(self.singles[kind].lower for kind in self.group.kind))
+
+    @property
+    def lower(self) -> float | None:
+        """Proved: the best policy has no lower AIHTR.
+
+        All own sets together cost no more than `apart`, and a detection more loses nothing where all sensors can do
+        what the safe action does, and are no dearer. None where they are or cannot, a budget forbids the union, or a
+        safe action that misses may take the place of sets that would not.
+        """
+        task = self.group.task
+        return self.apart if sensors_suffice(task) and task.safe else None
+
+    def card(self) -> Card:
+        """The bracket."""
+        per_step = (self.upper - self.apart) / self.group.expected_steps
+        facts = {
+            "targets": f"{len(self.group)}",
+            "separate trackers": decimal(self.apart, 4),
+            "upper bound": f"{decimal(self.upper, 4)}; {per_step:.2g} per step above these",
+            "proved from below": "by the union of their sets" if self.lower is not None else "no",
+            "seconds": f"{self.seconds:.2g}",
+        }
+        return Card(f"Solution for several targets: {grid_words(self.group.task.size)}", facts)

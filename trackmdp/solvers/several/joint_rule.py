@@ -1,0 +1,93 @@
+"""A network that reads what is known of all targets, as a policy for several targets."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import sparse
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from trackmdp.arrays.files import npz_bytes
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
+from trackmdp.durable import write_bytes
+from trackmdp.errors import UserError
+from trackmdp.solvers.several.group_tracker import GroupTracker
+from trackmdp.solvers.several.merging import Beliefs, Clocks, Rule
+from trackmdp.world.group import Group
+
+
+class JointRule(Rule):
+    """The most likely sets of an actor over the observations that `TrackEnv` shows of a group.
+
+    Args:
+        group: the targets.
+        actor: writes `action`; later changes of its weights have no effect.
+        device: of the actor.
+    """
+
+    name = "joint"
+    reads_history = True
+
+    def __init__(self, group: Group, actor: TensorDictModuleBase, device: torch.device) -> None:
+        super().__init__(group, ())
+        # Rounding differs with the number of rows of a batch. In double precision that does not turn a set over, so
+        # that an episode that is simulated again, beside others, is the same.
+        self._device, self.actor = device, copy.deepcopy(actor).to(device).double()
+
+    def within(self, group: Group) -> JointRule:
+        """See `Rule`."""
+        if group.targets != self.group.targets:
+            raise UserError(
+                f"policy: learned for targets of the kinds {list(self.group.targets)}, expected "
+                f"{list(group.targets)}"
+            )
+        return JointRule(group, self.actor, self._device)
+
+    def sets(self, seen: Clocks, moved: Beliefs) -> IndexArray:  # noqa: ARG002
+        """See `Rule`."""
+        return np.flatnonzero(self._chosen(seen))
+
+    def first_sets(self) -> list[sparse.csr_array]:
+        """See `Rule`; the single target is the only one in the grid."""
+        found = []
+        for kind in range(len(self.group.kinds)):
+            alone = np.arange(len(self.group)) == self.group.targets.index(kind)
+            start = self.start(np.arange(self.cells)[:, None] + self.group.kind * self.cells)
+            shown = Clocks(start.located, start.misses, start.present & alone, start.history)
+            found.append(sparse.csr_array(self._chosen(shown)))
+        return found
+
+    @torch.no_grad()
+    def _chosen(self, seen: Clocks) -> BoolArray:
+        """`[E, S]`."""
+        cell = seen.located - self.group.kind * self.cells
+        # A target that has left has no clock.
+        misses = np.where(seen.present, seen.misses, 0)
+        parts = {"last_cell": cell, "steps_since_detection": misses, "present": seen.present}
+        rows = {name: torch.as_tensor(part) for name, part in parts.items()}
+        rows["action_history"] = torch.as_tensor(seen.history)
+        state = TensorDict(rows, len(cell)).to(self._device)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            action = self.actor(state)["action"].cpu().numpy()
+        return action & self.task.available
+
+    def tracker(self, cells: Sequence[int]) -> GroupTracker:
+        """A tracker that follows targets located in `cells`, one for each."""
+        return GroupTracker(self, cells)
+
+    def packed(self) -> list[dict[str, Any]]:
+        """The weights by their names, in single precision as they were learned, and the kind of each target."""
+        weights = self.actor.state_dict().items()
+        found = {name: part.to(torch.float32).cpu().numpy() for name, part in weights}
+        return [{"targets": np.array(self.group.targets), **found}]
+
+    def save(self, file: Path, value: Array | None = None) -> None:  # noqa: ARG002 (there is none)
+        """Write `packed`; the same weights, the same bytes."""
+        write_bytes(file, npz_bytes(self.packed()[0]))

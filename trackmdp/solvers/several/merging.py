@@ -1,0 +1,312 @@
+"""Plans of single targets made one policy for several: what is predicted of each target, and the sensors to switch on.
+
+Each target has a belief of its own, under all sets that were really on. Beliefs of many episodes are lists of entries
+(row, state): row e · K + i is target i of episode e, and the states of all motions lie one after the other
+(`Group.kernel`). Example: two targets that move alike, one episode; target 0 may be in cell 4 or 5, target 1 in 4:
+
+    row  0 0 1        state  4 5 4        mass  .3 .6 .9
+
+Merged by gains, sensor j is on iff
+
+    sum over i of m_ij p_d(j) (r + V(j) - W_i(j))  >  c_j P(any target is in the grid),
+
+W_i(j) being the worth of going on with the plan of target i, the target being in j undetected.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.arrays.entries import among, per_row
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
+from trackmdp.errors import UserError
+from trackmdp.policies.saved import packed
+from trackmdp.policies.table import PolicyTable
+from trackmdp.sensing.choose import largest
+from trackmdp.solvers.renewal import Renewal
+from trackmdp.world.group import Group
+
+
+@dataclass(frozen=True)
+class Clocks:
+    """What the tracker is shown of E episodes; the other parts of a target that has left count for nothing.
+
+    Attributes:
+        located: `[E, K]`, state of the last detection.
+        misses: `[E, K]`, n.
+        present: `[E, K]`, whether the target is in the grid.
+        history: `[E, t_max + 1, S]`, the sets of the last steps, the latest first, for a rule that `reads_history`.
+    """
+
+    located: IndexArray
+    misses: IndexArray
+    present: BoolArray
+    history: BoolArray | None = None
+
+    def late(self, t_max: int) -> BoolArray:
+        """`[E]`, whether the safe action is due."""
+        return np.any(self.present & (self.misses > t_max), axis=1)
+
+    def remembered(self, on: IndexArray, late: BoolArray) -> BoolArray | None:
+        """The history after a step with the sensors `on`, sorted numbers e · S + j; none after a safe action."""
+        if self.history is None:
+            return None
+        latest = np.zeros_like(self.history[:, :1])
+        latest.reshape(-1)[on] = True
+        return np.concatenate([latest, self.history[:, :-1]], axis=1) & ~late[:, None, None]
+
+
+Reports: TypeAlias = tuple[BoolArray, BoolArray]
+"""`[E, K]` each: whether a target is in the grid after the step, and whether it was located."""
+
+
+@dataclass(frozen=True)
+class Beliefs:
+    """Entries of the beliefs of all rows, in order of (row, state).
+
+    Attributes:
+        row, state: `[L]`.
+        mass: `[L]`, probability of each, given all that the tracker is shown.
+    """
+
+    row: IndexArray
+    state: IndexArray
+    mass: Array
+
+    @classmethod
+    def at(cls, row: IndexArray, state: IndexArray) -> Beliefs:
+        """Targets known to be in a state."""
+        return cls(row, state, np.ones(len(row)))
+
+    @classmethod
+    def of(cls, clocks: Clocks) -> Beliefs:
+        """At the start, where the targets that are there are located."""
+        rows = np.flatnonzero(clocks.present)
+        return cls.at(rows, clocks.located.ravel()[rows])
+
+    def moved(self, group: Group) -> Beliefs:
+        """After a move; masses of a row then sum to the probability that its target is in the grid."""
+        kernel = group.kernel
+        begin, count = kernel.indptr[self.state], np.diff(kernel.indptr)[self.state]
+        # Entries 4 .. 6 and 9 .. 10 of the kernel, one after the other: 4 5 6 9 10.
+        source = np.repeat(np.arange(len(count)), count)
+        entry = np.arange(len(source)) + (begin - np.cumsum(count) + count)[source]
+        codes = self.row[source] * kernel.shape[0] + kernel.indices[entry]
+        found, place = np.unique(codes, return_inverse=True)
+        mass = per_row(place, self.mass[source] * kernel.data[entry], len(found))
+        row, state = np.divmod(found, kernel.shape[0])
+        return Beliefs(row, state, mass)
+
+    def inside(self, rows: int) -> Array:
+        """`[rows]`, mass of each row."""
+        return per_row(self.row, self.mass, rows)
+
+    def given(self, kept: BoolArray, seen: Array, rows: int) -> Beliefs:
+        """The rows `kept` `[rows]` of a step's `moved` beliefs, their targets in the grid and missed.
+
+        Args:
+            kept: rows of targets that are in the grid and were not detected.
+            seen: `[L]`, probability of a report at each entry.
+            rows: E · K.
+        """
+        mass = self.mass * (1.0 - seen)
+        some = kept[self.row] & (mass > 0)
+        row, mass = self.row[some], mass[some]
+        return Beliefs(row, self.state[some], mass / per_row(row, mass, rows)[row])
+
+    def joined(self, other: Beliefs, states: int) -> Beliefs:
+        """The entries of both, in order."""
+        parts = [
+            np.concatenate([getattr(self, name), getattr(other, name)])
+            for name in ("row", "state", "mass")
+        ]
+        order = np.argsort(parts[0] * states + parts[1], kind="stable")
+        return Beliefs(*(part[order] for part in parts))
+
+
+class Rule(ABC):
+    """A policy for several targets.
+
+    Args:
+        group: the targets.
+        tables: the policy of a single target, for each of `group.kinds`.
+    """
+
+    name = ""
+    reads_history = False
+    """Whether it reads the sets of the last steps, in place of beliefs."""
+
+    def __init__(self, group: Group, tables: Sequence[PolicyTable]) -> None:
+        self.group, self.tables = group, tuple(tables)
+        self.task = group.task
+        self.cells = self.task.num_cells
+        for table in tables:
+            table.check_fits(self.task)
+            if not table.deterministic or table.task.keyed:
+                raise UserError(
+                    "policy: expected one that remembers the cell and does not draw, for several targets"
+                )
+
+    def within(self, group: Group) -> Rule:
+        """The same policy for other targets of the same task."""
+        return self if group is self.group else type(self)(group, self.tables)
+
+    def start(self, located: IndexArray, present: BoolArray | None = None) -> Clocks:
+        """Targets of E episodes located in the states `[E, K]`: all, or those that are `present` `[E, K]`."""
+        history = np.zeros((len(located), self.task.num_choices, self.cells), dtype=bool)
+        kept = history if self.reads_history else None
+        here = np.ones(located.shape, dtype=bool) if present is None else present
+        return Clocks(np.where(here, located, 0), np.zeros_like(located), here, kept)
+
+    def first_sets(self) -> list[sparse.csr_array]:
+        """For each kind `[M, S]`, the set of a single target that is located."""
+        return [table.written[:: self.task.num_choices] for table in self.tables]
+
+    def packed(self) -> list[dict[str, Any]]:
+        """The arrays from which it is made again, of each kind."""
+        return [packed(table) for table in self.tables]
+
+    @abstractmethod
+    def sets(self, seen: Clocks, moved: Beliefs) -> IndexArray:
+        """Sorted numbers e · S + j of the sensors j that are on in episode e.
+
+        Args:
+            seen: what the tracker is shown.
+            moved: where the targets may be after the move.
+        """
+
+
+class Union(Rule):
+    """Each target's own set, all of them together."""
+
+    name = "union"
+
+    def __init__(self, group: Group, tables: Sequence[PolicyTable]) -> None:
+        super().__init__(group, tables)
+        if self.task.budget is not None:
+            raise UserError(
+                f"targets.merge=union: expected gains with a budget, {self.task.budget}"
+            )
+
+    def sets(self, seen: Clocks, moved: Beliefs) -> IndexArray:  # noqa: ARG002
+        """See `Rule`."""
+        free = seen.present & (seen.misses <= self.task.t_max)
+        found = []
+        for kind, table in enumerate(self.tables):
+            episode, target = np.nonzero(free & (self.group.kind == kind))
+            cell = seen.located[episode, target] - kind * self.cells
+            row = cell * self.task.num_choices + seen.misses[episode, target]
+            on = table.written[row].tocoo()
+            found.append(episode[on.row] * self.cells + on.col)
+        return np.unique(np.concatenate(found))
+
+
+class Merged(Rule):
+    """Gains of all targets, added up for each sensor."""
+
+    name = "gains"
+
+    @cached_property
+    def _plans(self) -> tuple[Array, list[tuple[IndexArray, Array]]]:
+        """`[Z]` V of all kinds; and for each n sorted numbers located · Z + state with W there."""
+        states = self.group.kernel.shape[0]
+        values = []
+        worths = [(list[IndexArray](), list[Array]()) for _ in range(self.task.num_choices)]
+        # Plans are those of whole episodes, also where these are cut off.
+        for kind, (world, table) in enumerate(zip(self.group.kinds, self.tables, strict=True)):
+            renewal = Renewal(world, world.motion)
+            sets = renewal.sets(table)
+            value = renewal.value(sets)
+            # Behind the cells stand those in which the safe action has missed, if it does.
+            values.append(value[: self.cells])
+            after = renewal.problem(value).after([on[:, None] for on in sets])
+            for step, worth, (codes, found) in zip(renewal.steps, after, worths, strict=False):
+                located, state = step.rows + kind * self.cells, step.states + kind * self.cells
+                codes.append(located.astype(np.int64) * states + state)
+                found.append(worth[:, 0])
+        return np.concatenate(values), [
+            (np.concatenate(codes), np.concatenate(found)) for codes, found in worths
+        ]
+
+    def credit(self, located: IndexArray, misses: IndexArray, state: IndexArray) -> Array:
+        """`[L]`, r + V - W of targets in `state`."""
+        value, worths = self._plans
+        lost, codes = np.zeros(len(state)), located * self.group.kernel.shape[0] + state
+        for n, (known, worth) in enumerate(worths):
+            now = misses == n
+            place = np.searchsorted(known, codes[now])
+            assert (known[place] == codes[now]).all()
+            lost[now] = worth[place]
+        return self.task.reward + value[state] - lost
+
+    def sets(self, seen: Clocks, moved: Beliefs) -> IndexArray:
+        """See `Rule`."""
+        episodes, targets = seen.present.shape
+        free = (seen.misses <= self.task.t_max).ravel()[moved.row]
+        row, state = moved.row[free], moved.state[free]
+        located, misses = seen.located.ravel()[row], seen.misses.ravel()[row]
+        cell, episode = state % self.cells, row // targets
+        gain = moved.mass[free] * self.credit(located, misses, state) * self.task.detects(cell)
+        codes, place = np.unique(episode * self.cells + cell, return_inverse=True)
+        gained = per_row(place, gain, len(codes))
+        gone = 1.0 - moved.inside(episodes * targets).reshape(episodes, targets)
+        price = (
+            self.task.prices[codes % self.cells] * (1.0 - gone.prod(axis=1))[codes // self.cells]
+        )
+        net = gained - price
+        on = net > 0
+        if self.task.budget is not None:
+            kept = largest(
+                codes // self.cells, np.where(on, net, -np.inf)[:, None], self.task.budget
+            )
+            on &= kept[:, 0]
+        return codes[on]
+
+
+def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str | None = None) -> Rule:
+    """The policy for several targets that single ones make, merged by `gains`, or their plain `union`.
+
+    None: by gains, but on recorded tracks, of which the moves pooled by cell say too little, the union. A budget needs
+    gains.
+    """
+    kinds = {"gains": Merged, "union": Union}
+    if merge is None:
+        known = group.recorded is None or group.task.budget is not None
+        merge = "gains" if known else "union"
+    if merge not in kinds:
+        raise UserError(f"merge={merge}: expected gains or union")
+    return kinds[merge](group, tables)
+
+
+def followed(
+    group: Group, clocks: Clocks, moved: Beliefs, on: IndexArray, place: IndexArray, report: Reports
+) -> tuple[Clocks, Beliefs]:
+    """Clocks and beliefs after a step.
+
+    Args:
+        group: the targets.
+        clocks: before the step.
+        moved: beliefs after the move.
+        on: sorted numbers e · S + j of the sensors j that were on in episode e.
+        place: `[E, K]`, states of the targets after the move.
+        report: which targets are in the grid, and which were located.
+    """
+    task, (present, seen) = group.task, report
+    cell, episode = moved.state % task.num_cells, moved.row // present.shape[1]
+    late, missed = clocks.late(task.t_max), (present & ~seen).ravel()
+    chance = among(on, episode * task.num_cells + cell)[1] * task.detects(cell)
+    chance = np.where(late[episode], task.safe_detection[cell], chance)
+    left = moved.given(missed, np.asarray(chance, dtype=np.float64), missed.size)
+    again = np.flatnonzero(seen.ravel())
+    found = left.joined(Beliefs.at(again, place.ravel()[again]), group.kernel.shape[0])
+    # A target that has left keeps no clock; one that the safe action missed is due for the next one.
+    misses = np.where(present & ~seen, np.minimum(clocks.misses + 1, task.t_max + 1), 0)
+    located = np.where(seen, place, clocks.located)
+    return Clocks(located, misses, present, clocks.remembered(on, late)), found

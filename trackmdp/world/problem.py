@@ -1,0 +1,24 @@
+"""A problem: a world, whose motion is known, or recorded tracks in place of it."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+from trackmdp.errors import UserError
+from trackmdp.recordings.tracks import Recorded
+from trackmdp.world.model import World
+
+Problem: TypeAlias = World | Recorded
+"""The subject of learning and evaluation: a world with its motion model, or recorded tracks."""
+
+
+def modelled(problem: Problem, caller: str) -> World:
+    """The problem, if it has a motion model.
+
+    Raises:
+        UserError: it is recorded tracks, or several targets.
+    """
+    if problem.model is None:
+        kind = type(problem).__name__
+        raise UserError(f"{caller}: needs a motion model, expected a World, not a {kind}")
+    return problem.model
