@@ -8,6 +8,7 @@ keys are the states.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Iterator
 
@@ -27,8 +28,9 @@ from trackmdp.world.model import World
 _STEPS, _SWEEPS = 12, 1
 _MOST_EVENTS, _MOST_STARTS, _LEAST_STARTS = 6_000, 16, 1
 """Events of all searches together, which bounds their time, and how many searches there are at most and at least."""
-_KICKED_EVENTS, _MOST_KICKS, _TAKEN = 16_000, 40, (0.1, 0.2, 0.5)
-"""The same for kicks, and shares of the keys that one changes. On three by three cells they gain up to .001 a step."""
+_KICKED_ENTRIES, _MOST_KICKS, _TAKEN = 1_100_000, 40, (0.1, 0.2, 0.5)
+"""Entries of the steps of all kicks, kicks at most, and shares of the keys that one changes. On three by three cells
+kicks gain up to .001 a step."""
 
 
 def solve(world: World, *, start: PolicyTable | None = None) -> Solution:
@@ -48,15 +50,23 @@ def solve(world: World, *, start: PolicyTable | None = None) -> Solution:
     return Solution(table, evaluation, bound, certified, seconds, nodes=0, interrupted=False)
 
 
-def best_found(world: World, *, start: PolicyTable | None = None, kicks: int = 0) -> PolicyTable:
-    """The policy of `solve`, without its bound, after so many `kicks` at most."""
+def best_found(
+    world: World,
+    *,
+    start: PolicyTable | None = None,
+    kicks: int = 0,
+    starts: int = _MOST_STARTS,
+) -> PolicyTable:
+    """The policy of `solve`, without its bound, after so many `starts` and `kicks` at most."""
     renewal = Renewal(world, world.motion)
-    policies = [exchanged(renewal, each) for each in _starts(renewal, world, start)]
+    begins = itertools.islice(_starts(renewal, world, start), starts)
+    policies = [exchanged(renewal, each) for each in begins]
     first = max(policies, key=lambda policy: policy.aihtr)
     others = [policy.sets for policy in policies if policy is not first]
     best = best_of(renewal, first, others)
     if others:
-        best = _kicked(renewal, best, others, min(kicks, _KICKED_EVENTS // renewal.count))
+        entries = sum(len(step.rows) for step in renewal.steps)
+        best = _kicked(renewal, best, others, min(kicks, _KICKED_ENTRIES // entries))
     return renewal.table(best.sets)
 
 
@@ -76,12 +86,16 @@ def _kicked(renewal: Renewal, best: Found, others: list[list[BoolArray]], kicks:
 
 
 def _starts(renewal: Renewal, world: World, start: PolicyTable | None) -> Iterator[Found]:
-    """Policies to search from: a known one, the homotopy, the optimum without modes, all on, none, other homotopies."""
+    """Policies to search from: a known one, homotopies, the optimum without modes, all on, none."""
     if start is not None:
         yield Found(renewal, renewal.sets(start))
-    count = min(max(_MOST_EVENTS // renewal.count, _LEAST_STARTS), _MOST_STARTS)
+    count = min(max(_MOST_EVENTS // renewal.count, _LEAST_STARTS), _MOST_STARTS) - 1
     first = Found(renewal, clocked_sets(renewal, world))
     yield follow_credit(renewal, world, first, _STEPS, _SWEEPS)
+    # Homotopies mostly lead to better policies than the rest; of many starts some are of the rest.
+    homotopies = max(count - 3, min(count, 2))
+    for sets in other_starts(renewal, world, homotopies, _STEPS, _SWEEPS):
+        yield Found(renewal, sets)
     plain = optimal.solve(averaged(world)).table
     cells = renewal.keys.cell(renewal.plans)
     fixed = [
@@ -93,9 +107,7 @@ def _starts(renewal: Renewal, world: World, start: PolicyTable | None) -> Iterat
     ]
     if world.budget is None:
         fixed.insert(1, renewal.sets(PolicyTable.all_on(world)))
-    for sets in fixed[: count - 1]:
-        yield Found(renewal, sets)
-    for sets in other_starts(renewal, world, count - 4, _STEPS, _SWEEPS):
+    for sets in fixed[: count - homotopies]:
         yield Found(renewal, sets)
 
 
