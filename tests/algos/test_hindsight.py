@@ -119,7 +119,7 @@ def test_where_the_target_moves_alike_few_frames_are_enough() -> None:
 
 def test_joint_changes_begin_from_both_actors() -> None:
     """On the paths that judge the clocked actor's sets, changed, earn more here than those of the actor."""
-    world = make_world("heading", size=3, memory="displacement")
+    world = make_world("heading", size=4, memory="displacement")
     words = ("algo.updates=60", "algo.updates_per_iteration=60", "algo.batch_size=2048")
     learner = learn(world, batches(world), *words, "algo.hidden=32")
     found, buffer = PolicyTable(world, learner.actor.sets), learner._buffer
@@ -130,7 +130,7 @@ def test_joint_changes_begin_from_both_actors() -> None:
         return along(judged, KeyPlans.of_table(table, judged.keys)).reward
 
     def changed(sets: sparse.csr_array) -> PolicyTable:
-        start = [lambda _: PolicyTable(world, sets)]
+        start = [lambda *_: PolicyTable(world, sets)]
         options = {"priors": (), "others": start, "discount": 0.95, "seed": buffer.judge}
         return choose_plan(world, buffer.tracks(), **options).policy
 

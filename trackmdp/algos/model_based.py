@@ -2,7 +2,7 @@
 
 Where the next move depends on the cell alone, the estimate is a kernel of pooled moves, planned on by the solvers.
 Where it may not, plans are made on whole sensed paths; a quarter of them, not used for learning, chooses between these
-plans, the plan of the pooled moves and, on small grids, the plan for a target whose next move depends on its last one.
+plans, the plan of the pooled moves and, on small grids, plans for targets whose next move depends on the last ones.
 Steps are spent with all sensors on, or on sets planned for a kernel drawn from the posterior (posterior sampling,
 Thompson 1933), which costs far less and leaves moves to be inferred from misses.
 """
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,10 +22,10 @@ from tensordict import TensorDictBase
 from trackmdp.algos.common import arrays, known_alone, lifted, located, tensors
 from trackmdp.algos.estimates.alike import cell_classes
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
+from trackmdp.algos.estimates.last_moves import after_moves, displacements
 from trackmdp.algos.estimates.path_counts import plan_paths
 from trackmdp.algos.estimates.path_gains import Paths, thinned
 from trackmdp.algos.estimates.path_plans import TRIED, UNJUDGED, choose_plan
-from trackmdp.algos.estimates.second_order import displacements, second_order
 from trackmdp.algos.estimates.shrinkage import believed_world, least_worth_planning
 from trackmdp.algos.observed import SensedPaths, observed_paths
 from trackmdp.config.counting import ModelBasedConfig
@@ -51,7 +52,9 @@ _SAMPLES = 8
 _MOST_CELLS = 1_600
 """Cells up to which plans of pooled moves are tried beside those of paths."""
 _MOST_STATES = 500
-"""Pairs of a cell and a move up to which plans for moves that depend on the last one are tried as well."""
+"""Pairs of a cell and a move up to which plans for moves that depend on the last ones are tried as well."""
+_DEPTHS, _STARTS = (1, 2), 2
+"""Last moves on which the next one may depend, and searches for the plan for each; one from a plan for fewer paths."""
 
 
 class ModelBased:
@@ -149,7 +152,7 @@ class ModelBased:
             seen = len(displacements(task, *tracks.steps(task.num_cells)))
             states = 2 * task.num_cells * seen
             if self._compares and seen > 1 and states <= _MOST_STATES:
-                others.append(self._after_moves)
+                others += [partial(self._after_moves, moves) for moves in _DEPTHS]
             found = choose_plan(
                 task,
                 tracks,
@@ -168,14 +171,14 @@ class ModelBased:
         self._found["reward_per_move"] = found.reward / moves
         return found.policy
 
-    def _pooled(self, tracks: Tracks) -> PolicyTable:
+    def _pooled(self, tracks: Tracks, _: PolicyTable | None) -> PolicyTable:
         """The plan for the moves of `tracks`, as if the next one depended on the cell alone."""
         return lifted(self.task, exchange.solve(self._world(self._of_moves(tracks)), 0))
 
-    def _after_moves(self, tracks: Tracks) -> PolicyTable:
-        """The plan for a target whose next move depends on the cell and on its last move."""
-        world = second_order(self.task, tracks, self._of_moves(tracks), self._least)
-        return hidden.best_found(world)
+    def _after_moves(self, moves: int, tracks: Tracks, before: PolicyTable | None) -> PolicyTable:
+        """The plan for a target whose next move depends on the cell and on so many of its last moves."""
+        world = after_moves(self.task, tracks, self._of_moves(tracks), self._least, moves)
+        return hidden.best_found(world, start=before, starts=_STARTS if before is None else 1)
 
     def _of_moves(self, tracks: Tracks) -> sparse.csr_array:
         """`[M, M + 1]`, the kernel of the moves of `tracks`."""

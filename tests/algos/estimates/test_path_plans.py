@@ -70,7 +70,7 @@ def test_a_round_finds_the_best_plan_of_each_key(seed: int, first: bool) -> None
     followed = paths.follow(interleaved(task, sets))
     changed = exchanged_keys(paths, sets, followed, 1)
     assert changed is not None
-    found = np.stack([each.toarray() for each in changed], axis=1)
+    found = np.stack([each.toarray() for each in changed(1.0)], axis=1)
     plans = np.array(list(itertools.product([False, True], repeat=4))).reshape(16, 2, 2)
     for key in range(2):
         # Of cells alone the events are the points, in order.
@@ -119,9 +119,12 @@ def test_rare_keys_keep_their_plans() -> None:
     assert some is not None
     often = np.bincount(paths.renewal.owner, followed.visits) >= 5
     assert 0 < often.sum() < len(paths.keys)
-    changed = sum(each.sum(axis=1) for each in some) > 0
+    changed = sum(each.sum(axis=1) for each in some(1.0)) > 0
     assert changed.any()
     assert not changed[~often].any()
+    fewer = sum(each.sum(axis=1) for each in some(0.25)) > 0
+    assert 0 < fewer.sum() < changed.sum()
+    assert not fewer[~changed].any()
 
 
 def test_no_recording_learns_and_judges() -> None:
@@ -138,7 +141,9 @@ def test_the_choice_is_the_one_that_earns_most_where_it_is_judged() -> None:
     tracks, judge = line_walks(5, count=30), line_walks(5, count=31).select(np.arange(31) > 20)
     task = recorded(tracks, memory="displacement", clip=1)
     known = planned(task, judge, prior=0.0, discount=1.0, rounds=5).policy
-    found = choose_plan(task, tracks, judge=judge, others=[lambda _: known], discount=1.0, rounds=5)
+    found = choose_plan(
+        task, tracks, judge=judge, others=[lambda *_: known], discount=1.0, rounds=5
+    )
     others = [planned(task, tracks, prior=each, discount=1.0, rounds=5).policy for each in PRIORS]
     for other in (known, *others):
         assert (
@@ -154,15 +159,16 @@ def test_another_plan_that_is_chosen_is_made_of_all_paths_and_left_as_it_is() ->
     tracks = by_hand(*[[0, end] for end in ends], exits=False)
     task = recorded(tracks)
     known = planned(task, parted(tracks, 3)[1], prior=0.0, discount=1.0, rounds=5).policy
-    made: list[int] = []
+    made: list[tuple[int, bool]] = []
 
-    def other(paths: Tracks) -> PolicyTable:
-        made.append(len(paths))
+    def other(paths: Tracks, before: PolicyTable | None) -> PolicyTable:
+        made.append((len(paths), before is None))
+        assert before is None or (before.dense() == known.dense()).all()
         return known
 
     found = choose_plan(task, tracks, others=[other], discount=1.0, rounds=5, seed=3)
     assert np.flatnonzero(found.policy.dense()[0, 0]).tolist() == [5]
-    assert made == [6, 8]
+    assert made == [(6, True), (8, False)]
 
 
 def test_some_of_many_paths_have_as_many_events_as_asked_for() -> None:

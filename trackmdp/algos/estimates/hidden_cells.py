@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from trackmdp.algos.estimates.second_order import (
+from trackmdp.algos.estimates.last_moves import (
     WEIGHT,
     displacements,
     heading_after,

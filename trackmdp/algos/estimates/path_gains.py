@@ -11,17 +11,18 @@ Paths lead to few of the keys there are: plans are valued by the sets of those a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy import sparse
 
+from trackmdp.arrays.entries import row_index, with_data
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.policies.table import SetTable
 from trackmdp.recordings.tracks import Tracks
 from trackmdp.sensing.task import Task
 from trackmdp.solvers.linear import triangular
 from trackmdp.solvers.renewal import Act, Renewal
-from trackmdp.solvers.walk import all_events
+from trackmdp.solvers.walk import Passed, all_events
 
 
 @dataclass(frozen=True)
@@ -29,16 +30,38 @@ class AlongPaths:
     """A policy followed along all paths.
 
     Attributes:
-        reward: of all paths together, undiscounted.
+        paths: the paths.
+        acts: reports and prices of the policy.
+        steps: what it does in each step.
         visits: `[B]`, how often the policy comes to each event on its path.
-        gain: for each n `[E]`, worth of a report at each entry over a miss, discounted.
-        value: `[B]` V, discounted, times γ.
+        reward: of all paths together, undiscounted.
     """
 
-    reward: float
+    paths: Paths
+    acts: list[Act]
+    steps: list[Passed]
     visits: Array
-    gain: list[Array]
-    value: Array
+    reward: float
+
+    # Of policies that are tried only the reward is asked for.
+    @cached_property
+    def value(self) -> Array:
+        """`[B]` V, discounted, times γ."""
+        located = sum((step.located for step in self.steps[1:]), self.steps[0].located)
+        earned = np.sum([step.totals[:, 0] for step in self.steps], axis=0)
+        return triangular(located, earned, self.paths.order)
+
+    @cached_property
+    def gain(self) -> list[Array]:
+        """For each n `[E]`, worth of a report at each entry over a miss, discounted."""
+        renewal, value, gains = self.paths.renewal, self.value, list[Array]()
+        later = renewal.missed(value)
+        for (report, spent), step in reversed(list(zip(self.acts, renewal.steps, strict=False))):
+            detected = renewal.task.reward + value[step.following]
+            gains.insert(0, detected - later)
+            gross = step.moves @ (report * detected + (1.0 - report) * later)
+            later = gross - spent[step.before] * step.stay
+        return gains
 
 
 _SAMPLE = 100
@@ -57,6 +80,7 @@ class Paths:
         renewal: events and steps, moves discounted.
         times: `[B]`, how often the path of each event is among the tracks.
         copies: tracks for each that differs.
+        order: `[B]`, an order of the events in which each leads to later ones alone.
     """
 
     def __init__(self, task: Task, tracks: Tracks, discount: float) -> None:
@@ -66,7 +90,7 @@ class Paths:
         of_point = np.repeat(times, tracks.lengths).astype(np.float64)
         self.times = of_point[self.renewal.states]
         self.copies = float(times.mean())
-        self._order = np.argsort(self.renewal.states, kind="stable")
+        self.order = np.argsort(self.renewal.states, kind="stable")
         self._starts = np.bincount(self.renewal.first, minlength=self.renewal.count).astype(float)
 
     @property
@@ -86,31 +110,19 @@ class Paths:
         """A policy on all paths, its plans in the order of `keys`."""
         renewal, acts = self.renewal, self.acts(table)
         steps = renewal.passes(acts)
-        located = sum((step.located for step in steps[1:]), steps[0].located)
-        earned = np.sum([step.totals[:, 0] for step in steps], axis=0)
-        value = triangular(located, earned, self._order)
         # Undiscounted: the moves before the end of step n carry γ^(n + 1), of a repeated safe action γ.
         factors = [np.full(renewal.count, self._discount ** -(n + 1)) for n in range(len(steps))]
         factors[-1][renewal.count - renewal.events.forced :] = factors[0][0]
         plain = sum(
-            sparse.diags_array(factor) @ step.located
+            with_data(step.located, step.located.data * factor[row_index(step.located)])
             for step, factor in zip(steps, factors, strict=True)
         )
-        visits = triangular(plain, self._starts, self._order, transposed=True)
+        visits = triangular(plain, self._starts, self.order, transposed=True)
         reward = sum(
             float(visits @ (self.times * factor * step.totals[:, 0]))
             for step, factor in zip(steps, factors, strict=True)
         )
-        return AlongPaths(reward, visits, self._gains(acts, value), value)
-
-    def _gains(self, acts: list[Act], value: Array) -> list[Array]:
-        later, gains = self.renewal.missed(value), list[Array]()
-        for (report, spent), step in reversed(list(zip(acts, self.renewal.steps, strict=False))):
-            detected = self.task.reward + value[step.following]
-            gains.insert(0, detected - later)
-            gross = step.moves @ (report * detected + (1.0 - report) * later)
-            later = gross - spent[step.before] * step.stay
-        return gains
+        return AlongPaths(self, acts, steps, visits, reward)
 
 
 def thinned(task: Task, tracks: Tracks, most: int, seed: int) -> Tracks:

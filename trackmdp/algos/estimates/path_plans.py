@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 from scipy import sparse
@@ -42,13 +43,17 @@ _JUDGED = 0.25
 """Share of the recordings that judge, where no others are there for it."""
 
 
+Maker: TypeAlias = Callable[[Tracks, PolicyTable | None], PolicyTable]
+"""Makes a policy of paths; of more paths from the policy that it made of some of them, or None."""
+
+
 def choose_plan(
     task: Task,
     tracks: Tracks,
     *,
     judge: Tracks | None = None,
     priors: Sequence[float] = PRIORS,
-    others: Sequence[Callable[[Tracks], PolicyTable]] = (),
+    others: Sequence[Maker] = (),
     discount: float,
     rounds: int = 8,
     seed: int = 0,
@@ -61,7 +66,7 @@ def choose_plan(
         judge: validation paths; None: paths that `parted` draws from `tracks`, which do not count until all is
             chosen.
         priors: weights of the prior that are tried.
-        others: from paths to policies that are tried as they are, and from which policy iteration begins as well.
+        others: make policies that are tried as they are, and from which policy iteration begins as well.
         discount: γ of the credit.
         rounds: of policy iteration at most.
         seed: of the draw, where there is one.
@@ -70,28 +75,36 @@ def choose_plan(
     weights = [*priors, *(UNJUDGED for _ in others)]
     if not len(judge):  # nothing to choose by
         paths = Paths(task, tracks, discount)
-        if priors:
-            return plan_paths(paths, prior=UNJUDGED, rounds=rounds)
-        return _improved(paths, UNJUDGED, rounds, KeyPlans.of_table(others[0](tracks), paths.keys))
+        start = None if priors else _made(others[0], tracks, paths)
+        return plan_paths(paths, prior=UNJUDGED, rounds=rounds, start=start)
     little, enough = (thinned(task, counted, most, seed) for most in (TRIED, _MOST))
     paths = Paths(task, enough, discount)
     few = paths if little is enough else Paths(task, little, discount)
     judged = Paths(task, thinned(task, judge, _MOST, seed), discount)
     tried = [_improved(few, prior, rounds).plans for prior in priors]
-    tried += [KeyPlans.of_table(make(counted), few.keys) for make in others]
+    tried += [_made(make, counted, few) for make in others]
     order = _ranked(judged, tried)[:_SEARCHED]
     better = [_improved(paths, weights[place], rounds, tried[place]) for place in order]
-    plans = [*(tried[place] for place in order), *(each.plans for each in better)]
-    plans += [_searched(paths, each).plans for each in better]
+    searched = [_searched(paths, each) for each in better]
+    first = _first(judged, searched)
+    made = [each.plans for each in (*better, searched[first])]
+    plans = [*(tried[place] for place in order), *made]
     best = _ranked(judged, plans)[0]
     if counted is tracks:
         return _valued(paths, plans[best].on(paths.keys))
-    stage, place = best // len(order), order[best % len(order)]
+    stage, number = divmod(best, len(order))
+    place = order[number if stage < 2 else first]
     whole = Paths(task, thinned(task, tracks, _MOST, seed), discount)
     if stage == 0 and place >= len(priors):  # as it was made
-        return _valued(whole, KeyPlans.of_table(others[place - len(priors)](tracks), whole.keys))
+        again = _made(others[place - len(priors)], tracks, whole, plans[best].table())
+        return _valued(whole, again)
     last = _improved(whole, weights[place], rounds, plans[best])  # from the plan that was chosen
     return _searched(whole, last) if stage == 2 else last
+
+
+def _made(make: Maker, tracks: Tracks, paths: Paths, before: PolicyTable | None = None) -> KeyPlans:
+    """A plan that `make` makes of `tracks`, with rows of the keys of `paths`."""
+    return KeyPlans.of_table(make(tracks, before), paths.keys)
 
 
 def _improved(paths: Paths, prior: float, rounds: int, start: KeyPlans | None = None) -> Planned:
@@ -107,6 +120,11 @@ def _ranked(judged: Paths, plans: Sequence[KeyPlans]) -> list[int]:
     return np.argsort(-earned, kind="stable").tolist()
 
 
+def _first(judged: Paths, searched: Sequence[Planned]) -> int:
+    """The place of the best result of exchange, by all paths: on those it was made on, each was chosen alike."""
+    return int(np.argmax([each.reward + along(judged, each.plans).reward for each in searched]))
+
+
 def _valued(paths: Paths, plans: KeyPlans) -> Planned:
     """Plans with their reward on paths."""
     return Planned(plans, along(paths, plans).reward, len(paths.keys), 0)
@@ -120,17 +138,19 @@ def parted(tracks: Tracks, seed: int) -> tuple[Tracks, Tracks]:
 
 
 def _searched(paths: Paths, plan: Planned) -> Planned:
-    """Rounds of exchange from `plan`; after one that raises no reward, of half as many keys: those of largest gain."""
+    """Rounds of exchange from `plan`; where one raises no reward, half as many keys change, those of largest gain."""
     plans, share = plan.plans, 1.0
     followed = along(paths, plans)
+    found = exchanged_keys(paths, plans.sets, followed, _LEAST)
     for _ in range(_ROUNDS):
-        sets = exchanged_keys(paths, list(plans.sets), followed, _LEAST, share)
-        if sets is None:  # no key comes so often
+        if found is None:  # no key comes so often
             break
+        sets = found(share)
         tried = paths.follow(interleaved(paths.task, sets))
         if tried.reward > plan.reward * (1.0 + _RISE):
-            plans, followed = replace(plans, sets=sets), tried
+            plans = replace(plans, sets=sets)
             plan = replace(plan, plans=plans, reward=tried.reward, rounds=plan.rounds + 1)
+            found = exchanged_keys(paths, sets, tried, _LEAST)
         elif share > _LEAST_SHARE:
             share /= 2
         else:
@@ -140,11 +160,10 @@ def _searched(paths: Paths, plan: Planned) -> Planned:
 
 def exchanged_keys(
     paths: Paths,
-    sets: list[sparse.csr_array],
+    sets: Sequence[sparse.csr_array],
     followed: AlongPaths,
     least: int,
-    share: float = 1.0,
-) -> list[sparse.csr_array] | None:
+) -> Callable[[float], list[sparse.csr_array]] | None:
     """One round: the plans of keys that a policy came by `least` times or more, on the ways on from them.
 
     Args:
@@ -152,10 +171,10 @@ def exchanged_keys(
         sets: `[K, S]` bool of the policy for each n; left as they are.
         followed: the policy on the paths.
         least: keys that came less often keep their plans.
-        share: of the keys with better plans, the ones that gain most: with all changed at once visits may change.
 
     Returns:
-        The sets, or None where no key came so often.
+        The sets by the share of the keys with better plans that change, the ones that gain most: with all changed at
+        once visits may change. None where no key came so often.
     """
     owner = paths.renewal.owner
     arrived = per_row(owner, followed.visits, len(paths.keys))
@@ -171,20 +190,21 @@ def exchanged_keys(
     found = exchange(plans, ascended, np.ones(len(often), dtype=bool))
     worth, other = (plans.worth(candidates_of(each))[:, 0] for each in (before, found))
     gain = other - worth
-    few = gain < np.quantile(gain[gain > 0], 1.0 - share) if (gain > 0).any() else gain < 0
-    found = [
-        np.where(few[turn.choice.rows], old, new)
-        for turn, old, new in zip(plans.turns, before, found, strict=True)
-    ]
-    # The rows of these keys are replaced, those of all others stay.
-    stays = np.ones(len(paths.keys), dtype=bool)
-    stays[often] = False
-    changed = []
-    for turn, old, on in zip(plans.turns, sets, found, strict=True):
-        rows, kept = row_index(old), stays[row_index(old)]
-        row = np.concatenate([rows[kept], often[turn.choice.rows[on]]])
-        sensor = np.concatenate([old.indices[kept], turn.choice.sensors[on]])
-        changed.append(ones_at(row, sensor, old.shape))
+
+    def changed(share: float) -> list[sparse.csr_array]:
+        few = gain < np.quantile(gain[gain > 0], 1.0 - share) if (gain > 0).any() else gain < 0
+        # The rows of these keys are replaced, those of all others stay.
+        stays = np.ones(len(paths.keys), dtype=bool)
+        stays[often[~few]] = False
+        after = []
+        for turn, old, new in zip(plans.turns, sets, found, strict=True):
+            on = new & ~few[turn.choice.rows]
+            rows, kept = row_index(old), stays[row_index(old)]
+            row = np.concatenate([rows[kept], often[turn.choice.rows[on]]])
+            sensor = np.concatenate([old.indices[kept], turn.choice.sensors[on]])
+            after.append(ones_at(row, sensor, old.shape))
+        return after
+
     return changed
 
 
