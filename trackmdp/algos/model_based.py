@@ -53,8 +53,9 @@ _MOST_CELLS = 1_600
 """Cells up to which plans of pooled moves are tried beside those of paths."""
 _MOST_STATES = 500
 """Pairs of a cell and a move up to which plans for moves that depend on the last ones are tried as well."""
-_DEPTHS, _STARTS = (1, 2), 2
-"""Last moves on which the next one may depend, and searches for the plan for each; one from a plan for fewer paths."""
+_MOST_AFTER_TWO, _STARTS = 4_000, 2
+"""The same of triples of a cell and two moves times free choices, and searches for each plan; from a plan for fewer
+paths one."""
 
 
 class ModelBased:
@@ -152,7 +153,9 @@ class ModelBased:
             seen = len(displacements(task, *tracks.steps(task.num_cells)))
             states = 2 * task.num_cells * seen
             if self._compares and seen > 1 and states <= _MOST_STATES:
-                others += [partial(self._after_moves, moves) for moves in _DEPTHS]
+                others.append(partial(self._after_moves, 1))
+                if states * seen * task.num_choices <= _MOST_AFTER_TWO:
+                    others.append(partial(self._after_moves, 2))
             found = choose_plan(
                 task,
                 tracks,

@@ -28,9 +28,9 @@ from trackmdp.world.model import World
 _STEPS, _SWEEPS = 12, 1
 _MOST_EVENTS, _MOST_STARTS, _LEAST_STARTS = 6_000, 16, 1
 """Events of all searches together, which bounds their time, and how many searches there are at most and at least."""
-_KICKED_ENTRIES, _MOST_KICKS, _TAKEN = 1_100_000, 40, (0.1, 0.2, 0.5)
-"""Entries of the steps of all kicks, kicks at most, and shares of the keys that one changes. On three by three cells
-kicks gain up to .001 a step."""
+_KICKED_ENTRIES, _MOST_KICKS, _TAKEN = 900_000, 40, (0.1, 0.2, 0.5)
+"""Entries of the steps of all kicks in one order, kicks at most, and shares of the keys that one changes. On three by
+three cells kicks gain up to .001 a step."""
 
 
 def solve(world: World, *, start: PolicyTable | None = None) -> Solution:
@@ -59,15 +59,24 @@ def best_found(
 ) -> PolicyTable:
     """The policy of `solve`, without its bound, after so many `starts` and `kicks` at most."""
     renewal = Renewal(world, world.motion)
-    begins = itertools.islice(_starts(renewal, world, start), starts)
+    begins = itertools.islice(_starts(renewal, world, start, starts), starts)
     policies = [exchanged(renewal, each) for each in begins]
     first = max(policies, key=lambda policy: policy.aihtr)
     others = [policy.sets for policy in policies if policy is not first]
-    best = best_of(renewal, first, others)
-    if others:
-        entries = sum(len(step.rows) for step in renewal.steps)
-        best = _kicked(renewal, best, others, min(kicks, _KICKED_ENTRIES // entries))
+    entries = sum(len(step.rows) for step in renewal.steps)
+    kicks = min(kicks, _KICKED_ENTRIES // entries)
+    # Where a search ends depends on the order in which the others are mixed in: with kicks both orders are tried.
+    orders = [others, others[::-1]] if kicks and len(others) > 1 else [others]
+    best = max(
+        (_mixed(renewal, first, each, kicks) for each in orders), key=lambda policy: policy.aihtr
+    )
     return renewal.table(best.sets)
+
+
+def _mixed(renewal: Renewal, best: Found, others: list[list[BoolArray]], kicks: int) -> Found:
+    """The best policy with plans of the `others`, key by key, and then after kicks."""
+    best = best_of(renewal, best, others)
+    return _kicked(renewal, best, others, kicks) if others else best
 
 
 def _kicked(renewal: Renewal, best: Found, others: list[list[BoolArray]], kicks: int) -> Found:
@@ -85,17 +94,15 @@ def _kicked(renewal: Renewal, best: Found, others: list[list[BoolArray]], kicks:
     return best
 
 
-def _starts(renewal: Renewal, world: World, start: PolicyTable | None) -> Iterator[Found]:
-    """Policies to search from: a known one, homotopies, the optimum without modes, all on, none."""
+def _starts(
+    renewal: Renewal, world: World, start: PolicyTable | None, most: int = _MOST_STARTS
+) -> Iterator[Found]:
+    """Policies to search from: a known one, the homotopy, the optimum without modes, all on, none, other homotopies."""
     if start is not None:
         yield Found(renewal, renewal.sets(start))
-    count = min(max(_MOST_EVENTS // renewal.count, _LEAST_STARTS), _MOST_STARTS) - 1
+    count = min(max(_MOST_EVENTS // renewal.count, _LEAST_STARTS), most) - 1
     first = Found(renewal, clocked_sets(renewal, world))
     yield follow_credit(renewal, world, first, _STEPS, _SWEEPS)
-    # Homotopies mostly lead to better policies than the rest; of many starts some are of the rest.
-    homotopies = max(count - 3, min(count, 2))
-    for sets in other_starts(renewal, world, homotopies, _STEPS, _SWEEPS):
-        yield Found(renewal, sets)
     plain = optimal.solve(averaged(world)).table
     cells = renewal.keys.cell(renewal.plans)
     fixed = [
@@ -107,7 +114,11 @@ def _starts(renewal: Renewal, world: World, start: PolicyTable | None) -> Iterat
     ]
     if world.budget is None:
         fixed.insert(1, renewal.sets(PolicyTable.all_on(world)))
+    # Homotopies mostly lead to better policies than the rest: of two or three starts all are.
+    homotopies = max(count - 3, min(count, 2))
     for sets in fixed[: count - homotopies]:
+        yield Found(renewal, sets)
+    for sets in other_starts(renewal, world, homotopies, _STEPS, _SWEEPS):
         yield Found(renewal, sets)
 
 
