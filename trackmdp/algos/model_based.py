@@ -53,9 +53,9 @@ _MOST_CELLS = 1_600
 """Cells up to which plans of pooled moves are tried beside those of paths."""
 _MOST_STATES = 500
 """Pairs of a cell and a move up to which plans for moves that depend on the last ones are tried as well."""
-_MOST_AFTER_TWO, _STARTS = 4_000, 2
-"""The same of triples of a cell and two moves times free choices, and searches for each plan; from a plan for fewer
-paths one."""
+_MOST_AFTER_TWO, _STARTS, _KICKS = 4_000, 4, 6
+"""The same of triples of a cell and two moves times free choices, and searches and kicks for each plan; from a plan for
+fewer paths there is one search."""
 
 
 class ModelBased:
@@ -181,7 +181,8 @@ class ModelBased:
     def _after_moves(self, moves: int, tracks: Tracks, before: PolicyTable | None) -> PolicyTable:
         """The plan for a target whose next move depends on the cell and on so many of its last moves."""
         world = after_moves(self.task, tracks, self._of_moves(tracks), self._least, moves)
-        return hidden.best_found(world, start=before, starts=_STARTS if before is None else 1)
+        starts = _STARTS if before is None else 1
+        return hidden.best_found(world, start=before, starts=starts, kicks=_KICKS)
 
     def _of_moves(self, tracks: Tracks) -> sparse.csr_array:
         """`[M, M + 1]`, the kernel of the moves of `tracks`."""

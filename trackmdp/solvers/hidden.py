@@ -55,9 +55,9 @@ def best_found(
     *,
     start: PolicyTable | None = None,
     kicks: int = 0,
-    starts: int = _MOST_STARTS,
+    starts: int | None = None,
 ) -> PolicyTable:
-    """The policy of `solve`, without its bound, after so many `starts` and `kicks` at most."""
+    """The policy of `solve`, without its bound, after so many `kicks` at most, and `starts`; None: as time allows."""
     renewal = Renewal(world, world.motion)
     begins = itertools.islice(_starts(renewal, world, start, starts), starts)
     policies = [exchanged(renewal, each) for each in begins]
@@ -95,12 +95,13 @@ def _kicked(renewal: Renewal, best: Found, others: list[list[BoolArray]], kicks:
 
 
 def _starts(
-    renewal: Renewal, world: World, start: PolicyTable | None, most: int = _MOST_STARTS
+    renewal: Renewal, world: World, start: PolicyTable | None, most: int | None = None
 ) -> Iterator[Found]:
     """Policies to search from: a known one, the homotopy, the optimum without modes, all on, none, other homotopies."""
     if start is not None:
         yield Found(renewal, renewal.sets(start))
-    count = min(max(_MOST_EVENTS // renewal.count, _LEAST_STARTS), most) - 1
+    some = min(max(_MOST_EVENTS // renewal.count, _LEAST_STARTS), _MOST_STARTS)
+    count = (most or some) - 1
     first = Found(renewal, clocked_sets(renewal, world))
     yield follow_credit(renewal, world, first, _STEPS, _SWEEPS)
     plain = optimal.solve(averaged(world)).table
