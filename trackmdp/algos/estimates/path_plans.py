@@ -74,9 +74,8 @@ def choose_plan(
     counted, judge = parted(tracks, seed) if judge is None else (tracks, judge)
     weights = [*priors, *(UNJUDGED for _ in others)]
     if not len(judge):  # nothing to choose by
-        paths = Paths(task, tracks, discount)
-        start = None if priors else _made(others[0], tracks, paths)
-        return plan_paths(paths, prior=UNJUDGED, rounds=rounds, start=start)
+        start = None if priors else others[0]
+        return _unjudged(Paths(task, tracks, discount), tracks, start, rounds)
     little, enough = (thinned(task, counted, most, seed) for most in (TRIED, _MOST))
     paths = Paths(task, enough, discount)
     few = paths if little is enough else Paths(task, little, discount)
@@ -100,6 +99,13 @@ def choose_plan(
         return _valued(whole, again)
     last = _improved(whole, weights[place], rounds, plans[best])  # from the plan that was chosen
     return _searched(whole, last) if stage == 2 else last
+
+
+def _unjudged(paths: Paths, tracks: Tracks, start: Maker | None, rounds: int) -> Planned:
+    """Policy iteration with the weight that is taken unjudged, from the plan that `start` makes if there is one."""
+    if start is None:
+        return plan_paths(paths, prior=UNJUDGED, rounds=rounds)
+    return _improved(paths, UNJUDGED, rounds, _made(start, tracks, paths))
 
 
 def _made(make: Maker, tracks: Tracks, paths: Paths, before: PolicyTable | None = None) -> KeyPlans:
