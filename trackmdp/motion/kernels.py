@@ -1,6 +1,6 @@
 """Motion kernels: each function returns one sub-stochastic sparse matrix, row i summing to 1 - p_exit(i).
 
-The sampler of the environment is derived from the matrix (`motion/targets.py`); no law is written twice. Time and
+The sampler of the environment is derived from the matrix (`environment/targets.py`); no law is written twice. Time and
 memory follow the number of possible moves: a grid of 256 x 256 with five moves from each cell takes a second and 8 MB.
 """
 

@@ -104,23 +104,25 @@ def _starts(
     count = (most or some) - 1
     first = Found(renewal, clocked_sets(renewal, world))
     yield follow_credit(renewal, world, first, _STEPS, _SWEEPS)
-    plain = optimal.solve(averaged(world)).table
-    cells = renewal.keys.cell(renewal.plans)
-    fixed = [
-        [
-            plain.chosen(n, cells[each.rows], each.sensors) > 0
-            for n, each in enumerate(renewal.choices)
-        ],
-        renewal.sets(PolicyTable.none(world)),
-    ]
-    if world.budget is None:
-        fixed.insert(1, renewal.sets(PolicyTable.all_on(world)))
     # Homotopies mostly lead to better policies than the rest: of two or three starts all are.
     homotopies = max(count - 3, min(count, 2))
-    for sets in fixed[: count - homotopies]:
-        yield Found(renewal, sets)
+    if count > homotopies:
+        for sets in _fixed(renewal, world)[: count - homotopies]:
+            yield Found(renewal, sets)
     for sets in other_starts(renewal, world, homotopies, _STEPS, _SWEEPS):
         yield Found(renewal, sets)
+
+
+def _fixed(renewal: Renewal, world: World) -> list[list[BoolArray]]:
+    """Sets of the optimum without modes, of all on where no budget forbids it, and of none."""
+    plain = optimal.solve(averaged(world)).table
+    cells = renewal.keys.cell(renewal.plans)
+    optimum = [
+        plain.chosen(n, cells[each.rows], each.sensors) > 0
+        for n, each in enumerate(renewal.choices)
+    ]
+    every = [] if world.budget is not None else [renewal.sets(PolicyTable.all_on(world))]
+    return [optimum, *every, renewal.sets(PolicyTable.none(world))]
 
 
 def revealing(world: World) -> World:

@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays.numbers import whole_number
 from trackmdp.arrays.types import Array, Indices
 from trackmdp.config.several import MOST_TARGETS
 from trackmdp.errors import UserError
@@ -66,9 +67,7 @@ class Group(Carded):
         """
         if not hasattr(recorded, "tracks"):
             raise UserError(f"Group.of_tracks: a {type(recorded).__name__}, expected Recorded")
-        if not isinstance(count, (int, np.integer)) or not 1 <= count <= MOST_TARGETS:
-            expected = f"an integer from 1 to {MOST_TARGETS:,}"
-            raise UserError(f"Group.of_tracks: count={count}: expected {expected}")
+        count = whole_number("Group.of_tracks: count", count, 1, MOST_TARGETS)
         kernel = recorded.tracks.kernel(recorded.num_cells)
         return cls([World.of(recorded, kernel)] * count, recorded)
 
