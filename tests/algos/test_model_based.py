@@ -14,6 +14,7 @@ from tests.algos.estimates.test_path_counts import SWEEP
 from tests.helpers import algorithm, collect, headings, hop_world, small_world, train_config
 from tests.tracks import by_hand, recorded, write
 from tests.typed import refused
+from trackmdp.algos.estimates import path_plans
 from trackmdp.algos.estimates.shrinkage import believed_world
 from trackmdp.algos.model_based import ModelBased
 from trackmdp.algos.observed import observed_paths
@@ -180,8 +181,11 @@ def test_negligible_moves_are_planned_without_and_leave_the_exit_as_it_is() -> N
     np.testing.assert_allclose(believed.sum(axis=1), [0.9, 0.8, *[0.5] * 7])
 
 
-@pytest.mark.parametrize("prior", ["0", "null"])
-def test_it_learns_the_zigzag_from_recordings(prior: str) -> None:
+@pytest.mark.parametrize(("prior", "most"), [("0", 1_000_000), ("null", 1_000_000), ("null", 60)])
+def test_it_learns_the_zigzag_from_recordings(
+    prior: str, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(path_plans, "_MOST", most)
     # Recordings that end in different cells, so that some can judge.
     task = swept(lengths=(12, 13, 14, 15, 16, 17), memory="displacement", clip=1)
     learner = on_tracks(task, iterations=1, prior=prior)
@@ -189,6 +193,7 @@ def test_it_learns_the_zigzag_from_recordings(prior: str) -> None:
     moves = task.tracks.lengths - 1
     assert replay(task, task.tracks, learner.actor).totals[:, 0] == pytest.approx(moves * 0.8)
     assert figures["keys_seen"] > 7
+    assert figures["reward_per_move"] == pytest.approx(0.8, abs=0.01)
 
 
 def test_plans_on_paths_are_made_three_times_and_at_the_end() -> None:

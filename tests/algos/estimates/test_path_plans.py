@@ -11,6 +11,7 @@ from scipy import sparse
 
 from tests.algos.estimates.test_path_counts import planned
 from tests.tracks import by_hand, recorded
+from trackmdp.algos.estimates import path_plans
 from trackmdp.algos.estimates.path_counts import KeyPlans, along, interleaved
 from trackmdp.algos.estimates.path_gains import AlongPaths, Paths, thinned
 from trackmdp.algos.estimates.path_plans import PRIORS, choose_plan, exchanged_keys, parted
@@ -169,6 +170,26 @@ def test_another_plan_that_is_chosen_is_made_of_all_paths_and_left_as_it_is() ->
     found = choose_plan(task, tracks, others=[other], discount=1.0, rounds=5, seed=3)
     assert np.flatnonzero(found.policy.dense()[0, 0]).tolist() == [5]
     assert made == [(6, True), (8, False)]
+
+
+def test_where_paths_are_left_out_the_choice_is_not_planned_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As many are left out of all of them: only the paths would be others, and the judges among them."""
+    tracks = line_walks(5, count=40)
+    task = recorded(tracks, memory="displacement", clip=1)
+    known = planned(task, tracks, prior=0.0, discount=1.0, rounds=0).policy
+    made: list[int] = []
+
+    def other(paths: Tracks, before: PolicyTable | None) -> PolicyTable:
+        made.append(len(paths))
+        return known
+
+    for most, times in ((10_000, [30, 40]), (300, [30])):
+        monkeypatch.setattr(path_plans, "_MOST", most)
+        made.clear()
+        choose_plan(task, tracks, priors=(), others=[other], discount=1.0, rounds=0)
+        assert made == times
 
 
 def test_some_of_many_paths_have_as_many_events_as_asked_for() -> None:

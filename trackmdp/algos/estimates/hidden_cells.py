@@ -14,7 +14,6 @@ from typing import TypeAlias
 import numpy as np
 
 from trackmdp.algos.estimates.last_moves import (
-    WEIGHT,
     displacements,
     heading_after,
     headings,
@@ -31,6 +30,8 @@ _MOST_MOVES = 50
 """Displacements up to which cells are drawn so: where targets leap far, the last move tells little."""
 _LEAP = 1e-6
 """Probability of any other move: guesses that no draw would hold for possible can be left one by one."""
+_WEIGHT = 3.0
+"""Moves as many as which those from a cell, after any move, count among those after the last one."""
 _AT_ONCE = 2**21
 """Unknown cells times displacements worked on at once: some 20 MB an array."""
 
@@ -134,7 +135,7 @@ class _Moves:
         codes = _codes(self.task, self.moves, cell, mode, after)
         count = {name: _looked_up(*self.counts[name], each) for name, each in codes.items()}
         alone: Array = count["bc"] / np.maximum(count["b"], 1.0)
-        return (count["bmc"] + WEIGHT * alone) / (count["bm"] + WEIGHT) + _LEAP
+        return (count["bmc"] + _WEIGHT * alone) / (count["bm"] + _WEIGHT) + _LEAP
 
 
 def _codes(

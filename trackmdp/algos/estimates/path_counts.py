@@ -45,12 +45,14 @@ class Planned:
     Attributes:
         plans: a set for every key and n.
         reward: of all paths together.
+        moves: on them.
         seen: keys that some path may lead to.
         rounds: of policy iteration that raised the reward.
     """
 
     plans: KeyPlans
     reward: float
+    moves: int
     seen: int
     rounds: int
 
@@ -146,7 +148,7 @@ def plan_paths(
         if after.reward <= value.reward:
             break
         plans, value, kept = tried.plans, after, kept + 1
-    return Planned(plans(), value.reward, len(paths.keys), kept)
+    return Planned(plans(), value.reward, paths.moves, len(paths.keys), kept)
 
 
 class _View:

@@ -80,11 +80,13 @@ class Paths:
         renewal: events and steps, moves discounted.
         times: `[B]`, how often the path of each event is among the tracks.
         copies: tracks for each that differs.
+        moves: on all of the tracks.
         order: `[B]`, an order of the events in which each leads to later ones alone.
     """
 
     def __init__(self, task: Task, tracks: Tracks, discount: float) -> None:
         self.task, self._discount = task, discount
+        self.moves = len(tracks.cells) - len(tracks)
         tracks, times = different(tracks)
         self.renewal = Renewal(task, tracks.motion().discounted(discount))
         of_point = np.repeat(times, tracks.lengths).astype(np.float64)
