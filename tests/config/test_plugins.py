@@ -108,7 +108,7 @@ NEW = "sensor=fading task.memory=misses kernel=heading kernel.exit_probability=0
 
 def test_a_new_sensor_and_a_new_memory_work_in_every_command(site: Path, tmp_path: Path) -> None:
     """Sensors that see less far away and the gap between detections: solved, learned, simulated, logged, replayed."""
-    few = "collector.total_frames=10000 evaluation.every=1 algo=a2c"
+    few = "collector.total_frames=10000 evaluation.every=1 algo=a2c optimal.enabled=false"
     lines = (
         f"solve {NEW} hydra.run.dir=solved",
         f"train {NEW} {few} hydra.run.dir=run",

@@ -27,9 +27,10 @@ from trackmdp.world.model import World
 _STEPS, _SWEEPS = 12, 1
 _MOST_EVENTS, _MOST_STARTS = 6_000, 16
 """Events of all searches together, which bounds their time, and searches at most."""
-_KICKED_ENTRIES, _MOST_KICKS, _TAKEN = 900_000, 200, (0.1, 0.2, 0.5)
-"""Entries of the steps of all kicks in one order, kicks at most, and shares of the keys that one changes. On three by
-three cells kicks gain up to .001 a step, with the cell alone in memory and sensors that miss .003."""
+_KICKED_ENTRIES, _MOST_KICKS, _MOST_SHARED, _TAKEN = 900_000, 200, 8, (0.1, 0.2, 0.5)
+"""Entries of the steps of all kicks in one order, kicks at most (of sensors that share cells, whose sets take some
+times as long), and shares of the keys that one changes. On three by three cells kicks gain up to .001 a step, with the
+cell alone in memory and sensors that miss .003."""
 
 
 def solve(world: World, *, start: PolicyTable | None = None) -> Solution:
@@ -58,7 +59,8 @@ def best_found(
     first = max(policies, key=lambda policy: policy.aihtr)
     others = [policy.sets for policy in policies if policy is not first]
     entries = sum(len(step.rows) for step in renewal.steps)
-    kicks = int(effort * min(_MOST_KICKS, _KICKED_ENTRIES // max(entries, 1)))
+    most = _MOST_KICKS if world.coverage is None else _MOST_SHARED
+    kicks = int(effort * min(most, _KICKED_ENTRIES // max(entries, 1)))
     # Where a search ends depends on the order in which the others are mixed in: with kicks both orders are tried.
     orders = [others, others[::-1]] if kicks and len(others) > 1 else [others]
     best = max(

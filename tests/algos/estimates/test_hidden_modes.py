@@ -130,9 +130,9 @@ def test_some_tracks_have_so_many_moves_or_few_more() -> None:
 
 
 def test_long_tracks_are_cut() -> None:
-    """450 moves: 200, 200 and 50."""
-    paths = _Paths.of(around(1, 451, 0), 4, 1_000, np.random.default_rng(0))
-    assert [len(step) for step in paths.steps] == [3] * 50 + [2] * 150
+    """250 moves: 100, 100 and 50."""
+    paths = _Paths.of(around(1, 251, 0), 4, 1_000, np.random.default_rng(0))
+    assert [len(step) for step in paths.steps] == [3] * 50 + [2] * 50
 
 
 @pytest.mark.slow

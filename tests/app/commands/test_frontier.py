@@ -80,7 +80,7 @@ def test_both_questions_are_answered(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 def test_an_open_bracket_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["kernel=heading", "grid.size=3", "resolution=0.1", f"hydra.run.dir={tmp_path / 'a'}"]
+    words = ["kernel=heading", "grid.size=3", "resolution=0.5", f"hydra.run.dir={tmp_path / 'a'}"]
     assert main(["frontier", *words]) == 0
     content = report(tmp_path / "a")
     assert content["certified"] is False
@@ -179,7 +179,7 @@ def test_the_figure_shows_the_corners_and_what_was_asked_for(tmp_path: Path) -> 
 
 
 def test_the_figure_shows_net_accuracy_and_an_open_bound(tmp_path: Path) -> None:
-    words = ["kernel=heading", "grid.size=3", "resolution=0.1", "quiet=true"]
+    words = ["kernel=heading", "grid.size=3", "resolution=0.5", "quiet=true"]
     assert main(["frontier", *words, f"hydra.run.dir={tmp_path / 'a'}"]) == 0
     drawn = (tmp_path / "a" / "frontier.svg").read_text(encoding="utf-8")
     assert ">net accuracy<" in drawn

@@ -24,7 +24,7 @@ from trackmdp.world.model import World
 _GUESSES, _FIRST_ROUNDS, _FIRST = 8, 15, 40_000
 """First guesses, and the rounds after which the most likely one goes on, on so many moves. With twelve modes the others
 end up to .04 a move below it."""
-_ROUNDS, _MOST, _LONGEST = 45, 200_000, 200
+_ROUNDS, _MOST, _LONGEST = 45, 200_000, 100
 """Rounds after them, and moves: with twelve modes a round takes a tenth of a second. All paths take a step at once, and
 longer ones are cut."""
 _FREE, _SPARED = 10, 2e-5
@@ -73,7 +73,7 @@ def _guessed(paths: _Paths, modes: int, rng: np.random.Generator) -> tuple[Array
 
 
 def _pieces(line: Tracks) -> tuple[IndexArray, IndexArray]:
-    """Where pieces of closed tracks begin, and their moves; a track of 450 moves has pieces of 200, 200 and 50."""
+    """Where pieces of closed tracks begin, and their moves; a track of 250 moves has pieces of 100, 100 and 50."""
     moves = line.lengths - 1
     count = -(-moves // _LONGEST)
     number = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
