@@ -81,8 +81,8 @@ def test_a_round_makes_the_tracks_likelier() -> None:
 
 def test_a_target_that_keeps_its_heading_is_predicted_from_its_last_move() -> None:
     """From 0 to 1, then on to 3 with probability .9, back to 0 with .1; half and half by the cell alone."""
-    world = with_modes(square(), around(300, 40, 1), 4, 0.0, seed=0)
-    kernel = world.kernel.toarray().reshape(4, 4, 4, 4)
+    world = with_modes(square(), around(300, 40, 1), 2, 0.0, seed=0)
+    kernel = world.kernel.toarray().reshape(4, 2, 4, 2)
     then = kernel[0, :, 1].sum(axis=0) @ kernel[1].sum(axis=2)
     assert then[3] / then.sum() == pytest.approx(KEPT, abs=0.03)
 

@@ -21,9 +21,9 @@ from trackmdp.recordings.tracks import Tracks
 from trackmdp.sensing.task import Task
 from trackmdp.world.model import World
 
-_GUESSES, _FIRST_ROUNDS, _FIRST = 8, 15, 40_000
-"""First guesses, and the rounds after which the most likely one goes on, on so many moves. With twelve modes the others
-end up to .04 a move below it."""
+_GUESSES, _FIRST_ROUNDS, _FIRST, _REFINED = 8, 15, 40_000, 2
+"""First guesses, and the rounds after which the most likely ones go on, on so many moves; and how many do. With twelve
+modes the others end up to .04 a move below them."""
 _ROUNDS, _MOST, _LONGEST = 45, 200_000, 100
 """Rounds after them, and moves: with twelve modes a round takes a tenth of a second. All paths take a step at once, and
 longer ones are cut."""
@@ -48,10 +48,11 @@ def with_modes(task: Task, tracks: Tracks, modes: int, least: float, seed: int) 
     """
     rng = np.random.default_rng(seed)
     few, paths = (_Paths.of(tracks, task.num_cells, most, rng) for most in (_FIRST, _MOST))
-    guesses = (_guessed(few, modes, rng) for _ in range(_GUESSES))
-    moves = few.on(paths, max(guesses, key=lambda guess: guess[1])[0])
-    for done in range(_ROUNDS):
-        moves, _ = paths.fitted(moves, _SPARED if done >= _FREE else 0.0)
+    guesses = sorted(
+        (_guessed(few, modes, rng) for _ in range(_GUESSES)), key=lambda guess: -guess[1]
+    )
+    fits = [_refined(paths, few.on(paths, moves)) for moves, _ in guesses[:_REFINED]]
+    moves = max(fits, key=lambda fit: fit[1])[0]
     # Half an exit in one more move, as of pooled moves: on recordings that all stop no episode would end.
     moves *= 1.0 - 0.5 / (paths.count + 1)
     pair, mode, to = np.nonzero(moves * paths.inside)
@@ -69,6 +70,14 @@ def _guessed(paths: _Paths, modes: int, rng: np.random.Generator) -> tuple[Array
     moves, likelihood = paths.normed(paths.ending(moves)), 0.0
     for _ in range(_FIRST_ROUNDS):
         moves, likelihood = paths.fitted(moves)
+    return moves, likelihood
+
+
+def _refined(paths: _Paths, moves: Array) -> tuple[Array, float]:
+    """A motion after all rounds, and the log-likelihood before the last one."""
+    likelihood = 0.0
+    for done in range(_ROUNDS):
+        moves, likelihood = paths.fitted(moves, _SPARED if done >= _FREE else 0.0)
     return moves, likelihood
 
 
