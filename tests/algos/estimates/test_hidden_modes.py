@@ -79,6 +79,16 @@ def test_a_round_makes_the_tracks_likelier() -> None:
     assert reached[-1] > reached[0] + 50
 
 
+def test_exits_are_not_spared_and_lead_to_no_mode() -> None:
+    """Spared a whole count of moves, only exits are left, beside the floor of the moves from 2 to 1."""
+    paths = of(TRACKS)
+    moves = paths.normed(paths.ending(np.random.default_rng(3).random((6, 2, 2))))
+    spared, _ = paths.fitted(moves, 1.0)
+    leaves = spared[PAIRS.index((2, 3))]
+    assert (leaves[:, 0] > 0.9).all()
+    assert (leaves[:, 1] == 0).all()
+
+
 def test_a_target_that_keeps_its_heading_is_predicted_from_its_last_move() -> None:
     """From 0 to 1, then on to 3 with probability .9, back to 0 with .1; half and half by the cell alone."""
     world = with_modes(square(), around(300, 40, 1), 2, 0.0, seed=0)

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
 from scipy import sparse
 
 from trackmdp.algos.estimates.shrinkage import without
-from trackmdp.arrays.entries import among, per_row, summing
+from trackmdp.arrays.entries import among, per_row, ranks, summing
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.recordings.tracks import Tracks
 from trackmdp.sensing.task import Task
@@ -51,7 +52,7 @@ def with_modes(task: Task, tracks: Tracks, modes: int, least: float, seed: int) 
     guesses = sorted(
         (_guessed(few, modes, rng) for _ in range(_GUESSES)), key=lambda guess: -guess[1]
     )
-    fits = [_refined(paths, few.on(paths, moves)) for moves, _ in guesses[:_REFINED]]
+    fits = [_after(paths, few.on(paths, moves), _ROUNDS, _FREE) for moves, _ in guesses[:_REFINED]]
     moves = max(fits, key=lambda fit: fit[1])[0]
     # Half an exit in one more move, as of pooled moves: on recordings that all stop no episode would end.
     moves *= 1.0 - 0.5 / (paths.count + 1)
@@ -63,32 +64,27 @@ def with_modes(task: Task, tracks: Tracks, modes: int, least: float, seed: int) 
 
 
 def _guessed(paths: _Paths, modes: int, rng: np.random.Generator) -> tuple[Array, float]:
-    """A random motion after the first rounds, and the log-likelihood before the last one."""
+    """A random motion after the first rounds, and its log-likelihood as of `_after`."""
     count = len(paths.share)
     after = rng.dirichlet(np.full(modes, _SPREAD), (count, modes))
     moves = paths.share[:, None, None] * rng.standard_gamma(1.0, (count, modes, 1)) * after
-    moves, likelihood = paths.normed(paths.ending(moves)), 0.0
-    for _ in range(_FIRST_ROUNDS):
-        moves, likelihood = paths.fitted(moves)
-    return moves, likelihood
+    return _after(paths, paths.normed(paths.ending(moves)), _FIRST_ROUNDS, _FIRST_ROUNDS)
 
 
-def _refined(paths: _Paths, moves: Array) -> tuple[Array, float]:
-    """A motion after all rounds, and the log-likelihood before the last one."""
+def _after(paths: _Paths, moves: Array, rounds: int, free: int) -> tuple[Array, float]:
+    """A motion after some rounds, the first of them `free`, and the log-likelihood before the last one."""
     likelihood = 0.0
-    for done in range(_ROUNDS):
-        moves, likelihood = paths.fitted(moves, _SPARED if done >= _FREE else 0.0)
+    for done in range(rounds):
+        moves, likelihood = paths.fitted(moves, _SPARED if done >= free else 0.0)
     return moves, likelihood
 
 
 def _pieces(line: Tracks) -> tuple[IndexArray, IndexArray]:
     """Where pieces of closed tracks begin, and their moves; a track of 250 moves has pieces of 100, 100 and 50."""
     moves = line.lengths - 1
-    count = -(-moves // _LONGEST)
-    number = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    offset = number * _LONGEST
-    first, moves = (np.repeat(each, count) for each in (line.first[:-1], moves))
-    return first + offset, np.minimum(moves - offset, _LONGEST)
+    track = np.repeat(np.arange(len(moves)), -(-moves // _LONGEST))
+    offset = ranks(track) * _LONGEST
+    return line.first[track] + offset, np.minimum(moves[track] - offset, _LONGEST)
 
 
 @dataclass(frozen=True)
@@ -135,10 +131,16 @@ class _Paths:
         ends = np.cumsum([len(step) for step in steps])
         return cls(code, before, after, inside, share, np.split(place, ends[:-1]))
 
-    @property
+    @cached_property
     def count(self) -> int:
         """Of all moves."""
         return sum(len(pairs) for pairs in self.steps)
+
+    @cached_property
+    def _by_pair(self) -> tuple[IndexArray, IndexArray]:
+        """The moves of all steps, one step after the other, in order of their pairs; and where each pair ends there."""
+        pair = np.concatenate(self.steps)
+        return np.argsort(pair, kind="stable"), np.cumsum(np.bincount(pair))
 
     def normed(self, moves: Array) -> Array:
         """`[P, K, K]` numbers of moves as probabilities."""
@@ -168,7 +170,7 @@ class _Paths:
 
     def _expected(self, moves: Array) -> tuple[Array, float]:
         """`[P, K, K]` expected number of moves, and the log-likelihood (forward and backward)."""
-        each, (pairs, modes, _) = moves.astype(np.float32), moves.shape
+        each, modes = moves.astype(np.float32), moves.shape[1]
         # Of the modes given the moves so far; each is as likely at the start.
         known, chances = [np.full((len(self.steps[0]), modes), 1.0 / modes, np.float32)], []
         for pair in self.steps:
@@ -182,14 +184,10 @@ class _Paths:
             onward.append(np.concatenate([later, ends]) / chance[:, None])
             later = (each[pair] @ onward[-1][:, :, None])[:, :, 0]
         # A move from k to j counts by P(k | before) P(move, j | k) P(later | j) / P(move, later | before).
-        pair = np.concatenate(self.steps)
-        before = np.concatenate(
-            [modes[: len(step)] for step, modes in zip(self.steps, known, strict=False)]
-        )
-        order, ends = np.argsort(pair, kind="stable"), np.cumsum(np.bincount(pair, minlength=pairs))
-        parts = zip(
-            *(np.split(part[order], ends[:-1]) for part in (before, np.concatenate(onward[::-1]))),
-            strict=True,
-        )
-        counts = moves * np.stack([one.T @ other for one, other in parts])
+        before = [mode[: len(pair)] for pair, mode in zip(self.steps, known, strict=False)]
+        order, last = self._by_pair
+        parts = [
+            np.split(np.concatenate(part)[order], last[:-1]) for part in (before, onward[::-1])
+        ]
+        counts = moves * np.stack([one.T @ other for one, other in zip(*parts, strict=True)])
         return counts, float(sum(np.log(each).sum(dtype=np.float64) for each in chances))

@@ -37,7 +37,7 @@ _ROUNDS, _LEAST_SHARE, _RISE = 30, 1 / 64, 1e-5
 """Rounds of exchange at most, the smallest share of the keys that are changed at once, and the least rise of reward."""
 _SEARCHED = 2
 """The best plans, which exchange begins from."""
-TRIED, _MOST, _JUDGES = 200_000, 1_000_000, 600_000
+TRIED, _MOST, _MOST_JUDGED = 200_000, 1_000_000, 600_000
 """Events on which plans are tried, on which the best are searched, and of validation paths: a round takes a second for
 a million. On 600,000, which is 40,000 points where the safe action may miss, plans ended up to .01 a step lower."""
 _JUDGED = 0.25
@@ -80,7 +80,7 @@ def choose_plan(
     little, enough = (thinned(task, counted, most, seed) for most in (TRIED, _MOST))
     paths = Paths(task, enough, discount)
     few = paths if little is enough else Paths(task, little, discount)
-    judged = Paths(task, thinned(task, judge, _JUDGES, seed), discount)
+    judged = Paths(task, thinned(task, judge, _MOST_JUDGED, seed), discount)
     tried = [_improved(few, prior, rounds).plans for prior in priors]
     tried += [_made(make, counted, few) for make in others]
     order = _ranked(judged, tried)[:_SEARCHED]
