@@ -201,7 +201,7 @@ def test_what_no_mixture_has_is_refused(asked: dict[str, float], named: str) -> 
 
 
 def test_where_the_bracket_stays_open_the_bound_is_above(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hidden, "_MOST_KICKS", 0)  # they take most of the time
+    monkeypatch.setattr(hidden, "_MOST_CROSSED", 0)  # takes most of the time
     world = tm.make_world("heading", size=3)
     made = frontier(world, resolution=0.02)
     assert not made.certified

@@ -50,9 +50,9 @@ _SAMPLES = 8
 """Kernels drawn for the uncertainty reported."""
 _MOST_CELLS = 1_600
 """Cells up to which plans of pooled moves are tried beside those of paths."""
-_MODES, _MOST_STATES, _EFFORT = 12, 500, 0.5
-"""Hidden modes of the motion that is fitted as well, up to so many pairs of a cell and a mode; and the effort of the
-search for its plan, of that of the solver. With six modes plans for nine velocities end .04 a step lower."""
+_MODES, _MOST_STATES, _ANNEALED, _EFFORT = 12, 500, 2, 0.35
+"""Hidden modes of the motion that is fitted as well, up to so many pairs of a cell and a mode; and of the search
+for its plan (`hidden.best_found`). With six modes plans for nine velocities end .04 a step lower."""
 
 
 class ModelBased:
@@ -174,7 +174,9 @@ class ModelBased:
         """The plan for a target with hidden modes."""
         seed = derive(self._seed, "modes")
         world = with_modes(self.task, tracks, _MODES, self._least, seed)
-        return hidden.best_found(world, start=before, effort=_EFFORT if before is None else 0.0)
+        if before is not None:
+            return exchange.improve(world, before)
+        return hidden.best_found(world, annealed=_ANNEALED, effort=_EFFORT)
 
     def _of_moves(self, tracks: Tracks) -> sparse.csr_array:
         """`[M, M + 1]`, the kernel of the moves of `tracks`."""

@@ -62,8 +62,15 @@ class Decisions(ABC):
         """
 
     @abstractmethod
-    def report(self, on: BoolArray) -> AnyArray:
-        """`[E, C]` probability that the set `on` `[G, C]` reports a target there; bool where no sensor misses."""
+    def report(self, on: AnyArray) -> AnyArray:
+        """`[E, C]` probability that the set `on` `[G, C]` reports a target there; bool where no sensor misses.
+
+        Or `on` `[G, 1]` are the probabilities with which the sensors are on, each independently of the others.
+        """
+
+    @abstractmethod
+    def slope(self, gain: Array, on: Array) -> Array:
+        """`[G, 1]` derivatives of the sum of `gain` `[E, 1]` times `report` by the probabilities `on` `[G, 1]`."""
 
     @abstractmethod
     def best(
@@ -154,7 +161,11 @@ class Own(Decisions):
         assert self.budget is not None
         return on & largest(self.rows, np.where(on, net, -np.inf), self.budget)
 
-    def report(self, on: BoolArray) -> AnyArray:
+    def slope(self, gain: Array, on: Array) -> Array:  # noqa: ARG002
+        """See `Decisions`."""
+        return self.gained(gain)
+
+    def report(self, on: AnyArray) -> AnyArray:
         """See `Decisions`."""
         there = on if self.group is None else on[self.group]
         return there if self.chance is None else there * self.chance

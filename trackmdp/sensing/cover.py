@@ -120,12 +120,26 @@ class Shared(Decisions):
         """`[E, C]` probability that no sensor of `on` `[G, C]` reports an entry."""
         return np.exp(self._logs @ on.astype(np.float64))
 
-    def report(self, on: BoolArray) -> AnyArray:
+    def report(self, on: AnyArray) -> AnyArray:
         """See `Decisions`."""
+        if on.dtype != np.bool_:
+            return 1.0 - self._missed(on)[0][:, None]
         if self.perfect:
             return self.sees.T @ on.astype(np.float64) > 0
         left = self._unreported(on)
         return np.where(left < 1e-15, 1.0, 1.0 - left)
+
+    def slope(self, gain: Array, on: Array) -> Array:
+        """See `Decisions`."""
+        # d/dq_s of 1 - prod (1 - p_s q_s) is p_s times the product over the others.
+        missed, alone = self._missed(on)
+        others = missed[self.sees.indices] / alone
+        return with_data(self.sees, self.sees.data * others) @ gain
+
+    def _missed(self, on: Array) -> tuple[Array, Array]:
+        """`[E]` probability that no sensor reports, of chances `on` `[G, 1]`; and that each one alone does not."""
+        alone = 1.0 - np.minimum(self.sees.data * on[row_index(self.sees), 0], _CERTAIN)
+        return np.exp(with_data(self.sees, np.log(alone)).sum(axis=0)), alone
 
     def gained(self, gain: Array) -> Array:
         """See `Decisions`."""

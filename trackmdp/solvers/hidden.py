@@ -13,10 +13,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from trackmdp.arrays.types import BoolArray
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers import optimal
+from trackmdp.solvers.annealing import anneal
 from trackmdp.solvers.exchange import best_of, exchanged, other_starts
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found, clocked_sets, follow_credit
@@ -25,12 +25,15 @@ from trackmdp.solvers.value import averaged_kernel, value_of
 from trackmdp.world.model import World
 
 _STEPS, _SWEEPS = 12, 1
-_MOST_EVENTS, _MOST_STARTS = 6_000, 16
-"""Events of all searches together, which bounds their time, and searches at most."""
-_KICKED_ENTRIES, _MOST_KICKS, _MOST_SHARED, _TAKEN = 900_000, 200, 8, (0.1, 0.2, 0.5)
-"""Entries of the steps of all kicks in one order, kicks at most (of sensors that share cells, whose sets take some
-times as long), and shares of the keys that one changes. On three by three cells kicks gain up to .001 a step, with the
-cell alone in memory and sensors that miss .003."""
+_MOST_EVENTS, _MOST_ENTRIES = 6_000, 400_000
+"""Events of all homotopies, and entries of the steps of all annealed policies (or events as many), which bound their
+time."""
+_MOST_LED, _MOST_ANNEALED = 4, 6
+"""Other homotopies, and annealed policies, at most."""
+_CROSSED_ENTRIES, _MOST_CROSSED, _MOST_SHARED, _ALIKE = 3_000_000, 400, 16, 1e-6
+"""Entries of the steps of all policies that are crossed, such policies at most (of sensors that share cells, whose sets
+take some times as long), and the relative difference up to which two count as one. On three by three cells crossing
+gains up to .001 a step, with the cell alone in memory and sensors that miss .003."""
 
 
 def solve(world: World, *, start: PolicyTable | None = None) -> Solution:
@@ -51,73 +54,71 @@ def solve(world: World, *, start: PolicyTable | None = None) -> Solution:
 
 
 def best_found(
-    world: World, *, start: PolicyTable | None = None, effort: float = 1.0
+    world: World, *, start: PolicyTable | None = None, annealed: int = 0, effort: float = 1.0
 ) -> PolicyTable:
-    """The policy of `solve`, without its bound, after so much of its searches and kicks (one search at least)."""
+    """The policy of `solve`, without its bound.
+
+    Args:
+        world: with hidden modes.
+        start: as of `solve`.
+        annealed: policies to anneal at least; in place of homotopies, where a search takes long.
+        effort: share of the policies that are crossed.
+    """
     renewal = Renewal(world, world.motion)
-    policies = [exchanged(renewal, each) for each in _starts(renewal, world, start, effort)]
-    first = max(policies, key=lambda policy: policy.aihtr)
-    others = [policy.sets for policy in policies if policy is not first]
-    entries = sum(len(step.rows) for step in renewal.steps)
-    most = _MOST_KICKS if world.coverage is None else _MOST_SHARED
-    kicks = int(effort * min(most, _KICKED_ENTRIES // max(entries, 1)))
-    # Where a search ends depends on the order in which the others are mixed in: with kicks both orders are tried.
-    orders = [others, others[::-1]] if kicks and len(others) > 1 else [others]
-    best = max(
-        (_mixed(renewal, first, each, kicks) for each in orders), key=lambda policy: policy.aihtr
-    )
-    return renewal.table(best.sets)
+    pool = [exchanged(renewal, each) for each in _starts(renewal, world, start, annealed)]
+    first = max(pool, key=_worth)
+    if len(pool) > 1:
+        others = [policy.sets for policy in pool if policy is not first]
+        pool.append(best_of(renewal, first, others))
+        most = _MOST_CROSSED if world.coverage is None else _MOST_SHARED
+        count = int(effort * min(most, _CROSSED_ENTRIES // _entries(renewal)))
+        pool = _crossed(renewal, pool, count)
+    return renewal.table(max(pool, key=_worth).sets)
 
 
-def _mixed(renewal: Renewal, best: Found, others: list[list[BoolArray]], kicks: int) -> Found:
-    """The best policy with plans of the `others`, key by key, and then after kicks."""
-    best = best_of(renewal, best, others)
-    return _kicked(renewal, best, others, kicks) if others else best
-
-
-def _kicked(renewal: Renewal, best: Found, others: list[list[BoolArray]], kicks: int) -> Found:
-    """Iterated local search: some keys take the plans of another local optimum, and exchange goes on from there."""
-    rng = np.random.default_rng(derive(0, "hidden", "kicks"))
-    for _ in range(kicks):
-        other = others[rng.integers(len(others))]
-        taken = rng.random(len(renewal.plans)) < rng.choice(_TAKEN)
+def _crossed(renewal: Renewal, pool: list[Found], count: int) -> list[Found]:
+    """A genetic search: `count` times exchange from the plans of one policy and of another, each key's by chance."""
+    rng = np.random.default_rng(derive(0, "hidden", "crossed"))
+    for _ in range(count):
+        pool = sorted(pool, key=_worth, reverse=True)
+        # The better one of two, and any other.
+        one, another = rng.integers(len(pool), size=2).min(), rng.integers(len(pool) - 1)
+        other = pool[another + (another >= one)]
+        taken = rng.random(len(renewal.plans)) < 0.5
         sets = [
             np.where(taken[choice.rows], new, old)
-            for choice, new, old in zip(renewal.choices, other, best.sets, strict=True)
+            for choice, new, old in zip(renewal.choices, other.sets, pool[one].sets, strict=True)
         ]
-        tried = exchanged(renewal, Found(renewal, sets))
-        best = tried if tried.aihtr > best.aihtr else best
-    return best
+        child = exchanged(renewal, Found(renewal, sets, pool[one]))
+        # Policies of one worth are mostly the same.
+        if not np.isclose(child.aihtr, [each.aihtr for each in pool], rtol=_ALIKE, atol=0.0).any():
+            pool[-1] = max(child, pool[-1], key=_worth)
+    return pool
+
+
+def _worth(policy: Found) -> float:
+    return policy.aihtr
 
 
 def _starts(
-    renewal: Renewal, world: World, start: PolicyTable | None, effort: float
+    renewal: Renewal, world: World, start: PolicyTable | None, least: int
 ) -> Iterator[Found]:
-    """Policies to search from: a known one, the homotopy, the optimum without modes, all on, none, other homotopies."""
+    """Policies to search from: a known one, those of homotopies, and annealed ones."""
     if start is not None:
         yield Found(renewal, renewal.sets(start))
-    count = min(max(int(effort * _MOST_EVENTS) // renewal.count, 1), _MOST_STARTS) - 1
-    first = Found(renewal, clocked_sets(renewal, world))
-    yield follow_credit(renewal, world, first, _STEPS, _SWEEPS)
-    # Homotopies mostly lead to better policies than the rest: of two or three starts all are.
-    homotopies = max(count - 3, min(count, 2))
-    if count > homotopies:
-        for sets in _fixed(renewal, world)[: count - homotopies]:
+    more, many = max(_MOST_EVENTS // renewal.count - 1, 0), _MOST_ENTRIES // _entries(renewal)
+    if many or not least:
+        first = Found(renewal, clocked_sets(renewal, world))
+        yield follow_credit(renewal, world, first, _STEPS, _SWEEPS)
+        for sets in other_starts(renewal, world, min(more, _MOST_LED), _STEPS, _SWEEPS):
             yield Found(renewal, sets)
-    for sets in other_starts(renewal, world, homotopies, _STEPS, _SWEEPS):
-        yield Found(renewal, sets)
+    rng = np.random.default_rng(derive(0, "hidden", "annealed"))
+    for place in range(min(max(more, many, least), _MOST_ANNEALED)):
+        yield anneal(renewal, world, rng, led=place % 2 == 1)
 
 
-def _fixed(renewal: Renewal, world: World) -> list[list[BoolArray]]:
-    """Sets of the optimum without modes, of all on where no budget forbids it, and of none."""
-    plain = optimal.solve(averaged(world)).table
-    cells = renewal.keys.cell(renewal.plans)
-    optimum = [
-        plain.chosen(n, cells[each.rows], each.sensors) > 0
-        for n, each in enumerate(renewal.choices)
-    ]
-    every = [] if world.budget is not None else [renewal.sets(PolicyTable.all_on(world))]
-    return [optimum, *every, renewal.sets(PolicyTable.none(world))]
+def _entries(renewal: Renewal) -> int:
+    return max(sum(len(step.rows) for step in renewal.steps), 1)
 
 
 def revealing(world: World) -> World:

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.arrays.entries import summing
-from trackmdp.arrays.types import Array, BoolArray, IndexArray
+from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
 from trackmdp.sensing.choose import Decisions
 
 
@@ -107,7 +107,7 @@ class Plans:
         self.mass, self.missed, self._credit = mass[:, None], missed[:, None], credit
         self.detected = [each[:, None] for each in detected]
 
-    def undetected(self, t: int, on: BoolArray, later: Array) -> Array:
+    def undetected(self, t: int, on: AnyArray, later: Array) -> Array:
         """W `[E_before, C]` before step t of set `on` `[G, C]`, followed by `later` `[E, C]` where it misses."""
         # W_t(i) = sum_j P_ij [h_j (r + V(j)) + (1 - h_j) W_{t+1}(j)] - c(A_t) P_in(i), h_j the probability of a report.
         turn = self.turns[t - 1]
@@ -116,7 +116,7 @@ class Plans:
         paid = self.layout.pay(t) @ on
         return gross - paid[self.layout.rows[t - 1]] * turn.stay[:, None]
 
-    def after(self, sets: Sequence[BoolArray], since: int = 0) -> list[Array]:
+    def after(self, sets: Sequence[AnyArray], since: int = 0) -> list[Array]:
         """W after the steps since + 1 ... H, `[E, C]` each, when `sets` go on; the first of them is not read."""
         later = [self.missed]
         for t in range(self.length, since + 1, -1):
@@ -128,7 +128,7 @@ class Plans:
         start = self.undetected(1, sets[0], self.after(sets)[0])
         return self.layout.sums(0) @ (self.mass * start)
 
-    def missing(self, t: int, on: BoolArray, mass: Array) -> Array:
+    def missing(self, t: int, on: AnyArray, mass: Array) -> Array:
         """`[E, C]`, the part of `mass` at step t that the set `on` leaves undetected."""
         return mass * (1.0 - self.turns[t - 1].choice.report(on))
 
@@ -170,10 +170,7 @@ class Plans:
             for t, later in enumerate(after, start=since + 1):
                 turn = self.turns[t - 1]
                 now = turn.back @ now
-                gain = self.detected[t - 1] - later
-                if optimism:
-                    assert self._credit is not None
-                    gain = optimism * self._credit[t - 1][:, None] + (1.0 - optimism) * gain
+                gain = self._gain(t, later, optimism)
                 before = sets[t - since - 1]
                 on = turn.choice.best(now * gain, self.priced(t, now), before, exact=exact)
                 chosen.append(on)
@@ -184,6 +181,32 @@ class Plans:
             # last one: each sweep is worth no less than the last.
             sets = chosen
         return sets
+
+    def advantages(self, chances: Sequence[Array], optimism: float) -> list[Array]:
+        """`[G]` for each step: what a sensor's being on gains over its being off, given that its plan comes so far.
+
+        Args:
+            chances: `[G, 1]` for each step, probabilities with which the sensors are on, independently of each other.
+            optimism: see `ascend`.
+        """
+        now, found = self.mass, []
+        for t, later in enumerate(self.after(chances), start=1):
+            turn, on = self.turns[t - 1], chances[t - 1]
+            now = turn.back @ now
+            gain = turn.choice.slope(now * self._gain(t, later, optimism), on)
+            come = (self.layout.sums(t) @ now)[turn.choice.rows]
+            net = gain - turn.price[:, None] * come
+            found.append(np.divide(net, come, out=np.zeros_like(net), where=come > 0)[:, 0])
+            now = self.missing(t, on, now)
+        return found
+
+    def _gain(self, t: int, later: Array, optimism: float) -> Array:
+        """`[E, C]`, of locating the target at step t over missing it, which is worth `later`."""
+        gain = self.detected[t - 1] - later
+        if not optimism:
+            return gain
+        assert self._credit is not None
+        return optimism * self._credit[t - 1][:, None] + (1.0 - optimism) * gain
 
     def none(self) -> list[BoolArray]:
         """Sets to start from: no sensor is on."""

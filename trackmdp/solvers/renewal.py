@@ -131,14 +131,14 @@ class Renewal:
         found.append(passed(task, last, mass, safe, task.safe_cost, 0.0, self.count)[0])
         return found
 
-    def acts(self, sets: Sequence[BoolArray]) -> Iterator[Act]:
-        """Reports and prices of `sets`."""
+    def acts(self, sets: Sequence[AnyArray]) -> Iterator[Act]:
+        """Reports and prices of `sets`, or of sensors that are on with such probabilities."""
         for choice, on in zip(self.choices, sets, strict=True):
-            paid = per_row(choice.rows[on], self.task.paid[choice.sensors[on]], len(self.plans))
+            paid = per_row(choice.rows, self.task.paid[choice.sensors] * on, len(self.plans))
             yield choice.report(on[:, None])[:, 0], paid[self.owner]
 
     def system(
-        self, sets: Sequence[BoolArray], *, guessed: bool = False
+        self, sets: Sequence[AnyArray], *, guessed: bool = False
     ) -> tuple[RenewalSystem, Array]:
         """The linear system of a policy, and `[B]` its expected reward until the next event.
 

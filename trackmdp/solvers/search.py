@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 
 from trackmdp.arrays.entries import per_row
-from trackmdp.arrays.types import Array, BoolArray, IndexArray
+from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.plans import Plans
@@ -34,7 +34,7 @@ class Found:
 
     Args:
         renewal: the problem.
-        sets: `[G]` bool for each free choice.
+        sets: `[G]` bool for each free choice, or the probabilities with which sensors are on.
         near: a policy of about the same value, or such a value `[B]`: where iterations begin.
 
     Attributes:
@@ -44,7 +44,7 @@ class Found:
     """
 
     def __init__(
-        self, renewal: Renewal, sets: Sequence[BoolArray], near: Found | Array | None = None
+        self, renewal: Renewal, sets: Sequence[AnyArray], near: Found | Array | None = None
     ) -> None:
         self.sets = list(sets)
         self._guess = near.value if isinstance(near, Found) else near
@@ -156,7 +156,7 @@ def columns_of(sets: Sequence[BoolArray]) -> list[BoolArray]:
     return [on[:, 0] for on in sets]
 
 
-def candidates_of(sets: Sequence[BoolArray]) -> list[BoolArray]:
+def candidates_of(sets: Sequence[AnyArray]) -> list[AnyArray]:
     """`[G, 1]`, one candidate."""
     return [on[:, None] for on in sets]
 
