@@ -80,7 +80,7 @@ def test_a_child_has_the_plans_of_two(monkeypatch: pytest.MonkeyPatch) -> None:
     renewal, begun = Renewal(world, world.motion), list[Found]()
     every, none = ([np.full(len(c.rows), on) for c in renewal.choices] for on in (True, False))
     better = exchange.exchanged(renewal, Found(renewal, none))
-    monkeypatch.setattr(hidden, "exchanged", lambda _, start: begun.append(start) or better)
+    monkeypatch.setattr(hidden, "exchanged", lambda *a, **_: begun.append(a[1]) or better)
     pool = hidden._crossed(renewal, [Found(renewal, every), Found(renewal, none)], 1)
     rows, on = renewal.choices[0].rows, begun[0].sets[0]
     share = [on[rows == row].mean() for row in np.unique(rows)]
@@ -104,7 +104,7 @@ def test_where_a_search_takes_long_some_are_annealed_in_place_of_homotopies(
 ) -> None:
     world, begun = make_world("heading", size=3), list[str]()
     monkeypatch.setattr(hidden, "_MOST_EVENTS", 0)
-    monkeypatch.setattr(hidden, "_MOST_ENTRIES", 0)
+    monkeypatch.setattr(hidden, "_MOST_WORK", 0)
     for name in ("follow_credit", "anneal"):
         made = getattr(hidden, name)
         monkeypatch.setattr(

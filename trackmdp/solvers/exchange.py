@@ -139,7 +139,13 @@ def best_of(
 
 
 def exchanged(
-    renewal: Renewal, policy: Found, *, go_on: GoOn = _always, once: bool = False, rounds: int = 40
+    renewal: Renewal,
+    policy: Found,
+    *,
+    go_on: GoOn = _always,
+    once: bool = False,
+    rounds: int = 40,
+    exact: bool = True,
 ) -> Found:
     """Policy iteration by exchange, until the AIHTR no longer grows.
 
@@ -149,6 +155,7 @@ def exchanged(
         go_on: asked before each part whether to look further.
         once: end after the first round, which gains most of it.
         rounds: at most so many.
+        exact: whether sets of shared sensors are at last the best ones, by linear programs.
     """
     everywhere = np.ones(len(renewal.plans), dtype=bool)
     tried = everywhere
@@ -173,9 +180,7 @@ def exchanged(
             break
         else:
             tried = everywhere
-    if renewal.task.coverage is not None:
-        policy = ascended(renewal, policy)
-    return policy
+    return ascended(renewal, policy) if exact and renewal.task.coverage is not None else policy
 
 
 def could_gain(renewal: Renewal, plans: Plans, policy: Found) -> BoolArray:

@@ -25,15 +25,14 @@ from trackmdp.solvers.value import averaged_kernel, value_of
 from trackmdp.world.model import World
 
 _STEPS, _SWEEPS = 12, 1
-_MOST_EVENTS, _MOST_ENTRIES = 6_000, 400_000
-"""Events of all homotopies, and entries of the steps of all annealed policies (or events as many), which bound their
-time."""
-_MOST_LED, _MOST_ANNEALED = 4, 6
-"""Other homotopies, and annealed policies, at most."""
-_CROSSED_ENTRIES, _MOST_CROSSED, _MOST_SHARED, _ALIKE = 3_000_000, 400, 16, 1e-6
-"""Entries of the steps of all policies that are crossed, such policies at most (of sensors that share cells, whose sets
-take some times as long), and the relative difference up to which two count as one. On three by three cells crossing
-gains up to .001 a step, with the cell alone in memory and sensors that miss .003."""
+_MOST_EVENTS, _MOST_WORK, _CROSSED_WORK, _SHARED = 6_000, 400_000, 3_000_000, 8
+"""What bounds the time: events of all homotopies; entries of the steps of all annealed policies (or events as many),
+and of all crossed ones; and as how many an event or entry counts where sensors share cells."""
+_ROUNDS = 20
+"""Of exchange, for policies from which the best one is made: the first gain most, and where sensors share cells two."""
+_MOST_LED, _MOST_ANNEALED, _MOST_CROSSED, _ALIKE = 4, 6, 400, 1e-6
+"""Other homotopies, annealed and crossed policies at most; and the relative difference up to which two count as one. On
+three by three cells crossing gains up to .001 a step, with the cell alone in memory and sensors that miss .003."""
 
 
 def solve(world: World, *, start: PolicyTable | None = None) -> Solution:
@@ -65,15 +64,17 @@ def best_found(
         effort: share of the policies that are crossed.
     """
     renewal = Renewal(world, world.motion)
-    pool = [exchanged(renewal, each) for each in _starts(renewal, world, start, annealed)]
-    first = max(pool, key=_worth)
-    if len(pool) > 1:
-        others = [policy.sets for policy in pool if policy is not first]
-        pool.append(best_of(renewal, first, others))
-        most = _MOST_CROSSED if world.coverage is None else _MOST_SHARED
-        count = int(effort * min(most, _CROSSED_ENTRIES // _entries(renewal)))
-        pool = _crossed(renewal, pool, count)
-    return renewal.table(max(pool, key=_worth).sets)
+    pool = [_searched(renewal, each) for each in _starts(renewal, world, start, annealed)]
+    others = sorted(pool, key=_worth, reverse=True)[1:]
+    best = best_of(renewal, max(pool, key=_worth), [policy.sets for policy in others])
+    if others:
+        count = min(_CROSSED_WORK // _work(renewal), _MOST_CROSSED)
+        best = max(_crossed(renewal, [*pool, best], int(effort * count)), key=_worth)
+    return renewal.table(exchanged(renewal, best).sets)
+
+
+def _searched(renewal: Renewal, policy: Found) -> Found:
+    return exchanged(renewal, policy, rounds=_ROUNDS // _slower(renewal), exact=False)
 
 
 def _crossed(renewal: Renewal, pool: list[Found], count: int) -> list[Found]:
@@ -89,7 +90,7 @@ def _crossed(renewal: Renewal, pool: list[Found], count: int) -> list[Found]:
             np.where(taken[choice.rows], new, old)
             for choice, new, old in zip(renewal.choices, other.sets, pool[one].sets, strict=True)
         ]
-        child = exchanged(renewal, Found(renewal, sets, pool[one]))
+        child = _searched(renewal, Found(renewal, sets, pool[one]))
         # Policies of one worth are mostly the same.
         if not np.isclose(child.aihtr, [each.aihtr for each in pool], rtol=_ALIKE, atol=0.0).any():
             pool[-1] = max(child, pool[-1], key=_worth)
@@ -106,7 +107,8 @@ def _starts(
     """Policies to search from: a known one, those of homotopies, and annealed ones."""
     if start is not None:
         yield Found(renewal, renewal.sets(start))
-    more, many = max(_MOST_EVENTS // renewal.count - 1, 0), _MOST_ENTRIES // _entries(renewal)
+    more = max(_MOST_EVENTS // (_slower(renewal) * renewal.count) - 1, 0)
+    many = _MOST_WORK // _work(renewal)
     if many or not least:
         first = Found(renewal, clocked_sets(renewal, world))
         yield follow_credit(renewal, world, first, _STEPS, _SWEEPS)
@@ -117,8 +119,12 @@ def _starts(
         yield anneal(renewal, world, rng, led=place % 2 == 1)
 
 
-def _entries(renewal: Renewal) -> int:
-    return max(sum(len(step.rows) for step in renewal.steps), 1)
+def _work(renewal: Renewal) -> int:
+    return _slower(renewal) * max(sum(len(step.rows) for step in renewal.steps), 1)
+
+
+def _slower(renewal: Renewal) -> int:
+    return 1 if renewal.task.coverage is None else _SHARED
 
 
 def revealing(world: World) -> World:
