@@ -9,6 +9,7 @@ import pytest
 
 from tests.helpers import headings
 from trackmdp.sensing.decisions import sensing
+from trackmdp.solvers import annealing
 from trackmdp.solvers.annealing import anneal
 from trackmdp.solvers.exchange import exchanged
 from trackmdp.solvers.renewal import Renewal
@@ -73,6 +74,33 @@ def test_an_advantage_is_what_a_chance_gains_a_visit(kind: str) -> None:
             rise += sign * Found(renewal, other).aihtr / 2e-5
         assert rise == pytest.approx(advantages[t - 1][place] * come[place], rel=1e-4, abs=1e-6)
         now = plans.missing(t, chance[:, None], now)
+
+
+def test_optimism_weighs_the_credit_against_the_exact_gain() -> None:
+    """A credit of .5 everywhere: full optimism leaves .5 p_d less the price, half of it the mean of both."""
+    world = world_of("own").but(detection=0.8)
+    renewal = Renewal(world, world.motion)
+    chances = [np.full((len(choice.rows), 1), 0.5) for choice in renewal.choices]
+    nothing = np.zeros(renewal.count)
+    credit = [np.full(world.num_states, 0.5) for _ in renewal.choices]
+    plans = renewal.problem(nothing, renewal.shares(nothing), credit)
+    exact, half, full = (plans.advantages(chances, share) for share in (0.0, 0.5, 1.0))
+    for one, mean, other, turn in zip(exact, half, full, plans.turns, strict=True):
+        np.testing.assert_allclose(mean, (one + other) / 2)
+        # The gain falls to those of its row in the sensor's cell: all of them together make 1.
+        share = (other + turn.price) / (0.5 * 0.8)
+        total = np.bincount(turn.choice.rows, share)
+        np.testing.assert_allclose(total[np.unique(turn.choice.rows)], 1.0)
+
+
+def test_sensors_out_of_the_window_have_no_chance() -> None:
+    world = headings(3, 0.8, cost=0.05, t_max=1, memory="displacement").but(window=1)
+    renewal = Renewal(world, world.motion)
+    odds = [np.full(len(choice.rows), 2.0) for choice in renewal.choices]
+    for choice, chance in zip(renewal.choices, annealing._chances(renewal, odds), strict=True):
+        assert choice.allowed is not None
+        np.testing.assert_allclose(chance, np.where(choice.allowed[:, 0], 1 / (1 + np.exp(-2)), 0))
+    assert 0 < (chance == 0).sum() < len(chance)  # two moves may lead out of it
 
 
 def test_annealed_policies_end_above_the_homotopy() -> None:
