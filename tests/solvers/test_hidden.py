@@ -74,6 +74,19 @@ def test_annealed_and_crossed_policies_end_higher(monkeypatch: pytest.MonkeyPatc
     assert missed > 11.1 > less > least
 
 
+def test_what_is_found_is_no_worse_than_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One homotopy ends lower than all searches; begun from their policy it ends no lower than that."""
+    world = make_world("heading", size=3, memory="cell").but(detection=0.8)
+    best = hidden.best_found(world)
+    for limit in ("_MOST_EVENTS", "_MOST_WORK", "_MOST_CROSSED"):
+        monkeypatch.setattr(hidden, limit, 0)
+    least, kept, again = (
+        evaluate(world, policy).aihtr
+        for policy in (hidden.best_found(world), best, hidden.best_found(world, start=best))
+    )
+    assert least < kept <= again + 1e-9
+
+
 def test_a_child_has_the_plans_of_two(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before exchange, about half of the keys' plans are those of each; the worst policy leaves the pool."""
     world = headings(3, 0.7, cost=0.12, memory="displacement")
