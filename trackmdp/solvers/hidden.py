@@ -25,9 +25,10 @@ from trackmdp.solvers.value import averaged_kernel, value_of
 from trackmdp.world.model import World
 
 _STEPS, _SWEEPS = 12, 1
-_MOST_EVENTS, _MOST_WORK, _CROSSED_WORK, _SHARED = 6_000, 400_000, 3_000_000, 8
-"""What bounds the time: events of all homotopies; entries of the steps of all annealed policies (or events as many),
-and of all crossed ones; and as how many an event or entry counts where sensors share cells."""
+_LED_EVENTS, _ANNEALED_EVENTS, _SHARED = 6_000, 10_000, 8
+_MOST_WORK, _CROSSED_WORK = 400_000, 3_000_000
+"""What bounds the time: events of all homotopies, and of all annealed policies; as how many an event or entry counts
+where sensors share cells; entries of the steps of all annealed policies, where these are more, and of crossed ones."""
 _ROUNDS = 20
 """Of exchange, for policies from which the best one is made: the first gain most, and where sensors share cells two."""
 _MOST_LED, _MOST_ANNEALED, _MOST_CROSSED, _ALIKE = 4, 6, 400, 1e-6
@@ -107,12 +108,15 @@ def _starts(
     """Policies to search from: a known one, those of homotopies, and annealed ones."""
     if start is not None:
         yield Found(renewal, renewal.sets(start))
-    more = max(_MOST_EVENTS // (_slower(renewal) * renewal.count) - 1, 0)
+    led, more = (
+        max(most // (_slower(renewal) * renewal.count) - 1, 0)
+        for most in (_LED_EVENTS, _ANNEALED_EVENTS)
+    )
     many = _MOST_WORK // _work(renewal)
     if many or not least:
         first = Found(renewal, clocked_sets(renewal, world))
         yield follow_credit(renewal, world, first, _STEPS, _SWEEPS)
-        for sets in other_starts(renewal, world, min(more, _MOST_LED), _STEPS, _SWEEPS):
+        for sets in other_starts(renewal, world, min(led, _MOST_LED), _STEPS, _SWEEPS):
             yield Found(renewal, sets)
     rng = np.random.default_rng(derive(0, "hidden", "annealed"))
     for place in range(min(max(more, many, least), _MOST_ANNEALED)):
