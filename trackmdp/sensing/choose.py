@@ -161,14 +161,14 @@ class Own(Decisions):
         assert self.budget is not None
         return on & largest(self.rows, np.where(on, net, -np.inf), self.budget)
 
-    def slope(self, gain: Array, on: Array) -> Array:  # noqa: ARG002
-        """See `Decisions`."""
-        return self.gained(gain)
-
     def report(self, on: AnyArray) -> AnyArray:
         """See `Decisions`."""
         there = on if self.group is None else on[self.group]
         return there if self.chance is None else there * self.chance
+
+    def slope(self, gain: Array, on: Array) -> Array:  # noqa: ARG002
+        """See `Decisions`."""
+        return self.gained(gain)
 
     def part(self, kept: IndexArray, entries: IndexArray, rows: IndexArray) -> Own:
         """See `Decisions`."""

@@ -39,7 +39,7 @@ def anneal(renewal: Renewal, world: World, rng: np.random.Generator, *, led: boo
         [spread * rng.standard_normal(len(choice.rows)) for choice in renewal.choices]
         for spread in (_SPREAD, _OFF * world.reward)
     )
-    credit, policy = credit_of(world), None
+    credit, policy = credit_of(world) if led else None, None
     for step, temperature in enumerate(np.geomspace(_WARM if led else _HOT, _COLD, _STEPS)):
         share = max(0.0, 1.0 - step / (_LED * _STEPS)) if led else 0.0
         chances = _chances(renewal, odds)

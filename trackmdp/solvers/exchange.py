@@ -37,7 +37,9 @@ from trackmdp.solvers.search import (
     clocked_sets,
     columns_of,
     follow_credit,
+    mixed,
     risen,
+    rows_changed,
     shares,
 )
 from trackmdp.world.model import World
@@ -54,6 +56,8 @@ OTHERS, PRICES_OFF, _STEPS, MOST_STARTED = 4, 0.2, 5, 500
 the steps of their homotopies, and the cells up to which they are made. On nine worlds of 9 x 9 and 10 x 10 cells four
 gained up to .0007 per step, on diagonal walks .002 to .007, twelve as much again or less; prices .1 or .4 off gained no
 more, nor did moves that are off, or 30 steps, for twice the time."""
+_ROUNDS = 40
+"""Of exchange, at most."""
 _SEEN = 1e-12
 """Keys with fewer visits an episode keep their plans: nothing is gained by them."""
 
@@ -90,8 +94,9 @@ def solve(world: World, starts: int = OTHERS) -> PolicyTable:
 
 def improve(world: World, policy: PolicyTable, *, once: bool = False) -> PolicyTable:
     """The result of exchange (`once`: one round of it) from a deterministic `policy`; its AIHTR is no lower."""
-    renewal = Renewal(world, world.motion)
-    return renewal.table(exchanged(renewal, Found(renewal, renewal.sets(policy)), once=once).sets)
+    renewal, rounds = Renewal(world, world.motion), 1 if once else _ROUNDS
+    start = Found(renewal, renewal.sets(policy))
+    return renewal.table(exchanged(renewal, start, rounds=rounds).sets)
 
 
 def other_starts(
@@ -128,10 +133,7 @@ def best_of(
             plans.worth(candidates_of(each))[:, 0] for each in (policy.sets, tried)
         )
         better = other_worth > worth + 1e-10 * (1.0 + np.abs(worth))
-        sets = [
-            np.where(better[turn.choice.rows], new, old)
-            for turn, new, old in zip(plans.turns, tried, policy.sets, strict=True)
-        ]
+        sets = mixed(plans.layout, better, tried, policy.sets)
         policy = risen(renewal, policy, plans, sets) or policy
         if not go_on():
             break
@@ -143,8 +145,7 @@ def exchanged(
     policy: Found,
     *,
     go_on: GoOn = _always,
-    once: bool = False,
-    rounds: int = 40,
+    rounds: int = _ROUNDS,
     exact: bool = True,
 ) -> Found:
     """Policy iteration by exchange, until the AIHTR no longer grows.
@@ -153,13 +154,12 @@ def exchanged(
         renewal: the problem.
         policy: where to start.
         go_on: asked before each part whether to look further.
-        once: end after the first round, which gains most of it.
-        rounds: at most so many.
+        rounds: at most so many; the first one gains most.
         exact: whether sets of shared sensors are at last the best ones, by linear programs.
     """
     everywhere = np.ones(len(renewal.plans), dtype=bool)
     tried = everywhere
-    for _ in range(1 if once else rounds):
+    for _ in range(rounds):
         if policy.visits is None:
             plans = renewal.problem(policy.value)
             some = tried & could_gain(renewal, plans, policy)
@@ -205,16 +205,6 @@ def revealed(world: World, detected: Array, missed: Array, length: int) -> Array
     for _ in range(length):
         worth = one_set(world, detected, worth)
     return worth
-
-
-def rows_changed(
-    layout: Layout, before: Sequence[BoolArray], after: Sequence[BoolArray]
-) -> BoolArray:
-    """`[K]`, the rows in which the sets differ."""
-    found = np.zeros(layout.count, dtype=bool)
-    for turn, old, new in zip(layout.turns, before, after, strict=True):
-        found[turn.choice.rows[old != new]] = True
-    return found
 
 
 def exchange(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from operator import attrgetter
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from trackmdp.solvers import optimal
 from trackmdp.solvers.annealing import anneal
 from trackmdp.solvers.exchange import best_of, exchanged, other_starts
 from trackmdp.solvers.renewal import Renewal
-from trackmdp.solvers.search import Found, clocked_sets, follow_credit
+from trackmdp.solvers.search import Found, clocked_sets, follow_credit, mixed
 from trackmdp.solvers.solution import Solution
 from trackmdp.solvers.value import averaged_kernel, value_of
 from trackmdp.world.model import World
@@ -34,6 +35,8 @@ _ROUNDS = 20
 _MOST_LED, _MOST_ANNEALED, _MOST_CROSSED, _ALIKE = 4, 6, 400, 1e-6
 """Other homotopies, annealed and crossed policies at most; and the relative difference up to which two count as one. On
 three by three cells crossing gains up to .001 a step, with the cell alone in memory and sensors that miss .003."""
+
+_worth = attrgetter("aihtr")
 
 
 def solve(world: World, *, start: PolicyTable | None = None) -> Solution:
@@ -66,8 +69,8 @@ def best_found(
     """
     renewal = Renewal(world, world.motion)
     pool = [_searched(renewal, each) for each in _starts(renewal, world, start, annealed)]
-    others = sorted(pool, key=_worth, reverse=True)[1:]
-    best = best_of(renewal, max(pool, key=_worth), [policy.sets for policy in others])
+    first, *others = sorted(pool, key=_worth, reverse=True)
+    best = best_of(renewal, first, [policy.sets for policy in others])
     if others:
         count = min(_CROSSED_WORK // _work(renewal), _MOST_CROSSED)
         best = max(_crossed(renewal, [*pool, best], int(effort * count)), key=_worth)
@@ -87,19 +90,12 @@ def _crossed(renewal: Renewal, pool: list[Found], count: int) -> list[Found]:
         one, another = rng.integers(len(pool), size=2).min(), rng.integers(len(pool) - 1)
         other = pool[another + (another >= one)]
         taken = rng.random(len(renewal.plans)) < 0.5
-        sets = [
-            np.where(taken[choice.rows], new, old)
-            for choice, new, old in zip(renewal.choices, other.sets, pool[one].sets, strict=True)
-        ]
+        sets = mixed(renewal.layout, taken, other.sets, pool[one].sets)
         child = _searched(renewal, Found(renewal, sets, pool[one]))
         # Policies of one worth are mostly the same.
         if not np.isclose(child.aihtr, [each.aihtr for each in pool], rtol=_ALIKE, atol=0.0).any():
             pool[-1] = max(child, pool[-1], key=_worth)
     return pool
-
-
-def _worth(policy: Found) -> float:
-    return policy.aihtr
 
 
 def _starts(

@@ -141,8 +141,11 @@ class Plans:
 
     def priced(self, t: int, mass: Array) -> Array:
         """`[G, C]`, expected price of each decision of step t, `mass` `[E, C]` being undetected before it."""
-        turn = self.turns[t - 1]
-        return turn.price[:, None] * (self.layout.sums(t) @ mass)[turn.choice.rows]
+        return self.turns[t - 1].price[:, None] * self._come(t, mass)
+
+    def _come(self, t: int, mass: Array) -> Array:
+        """`[G, C]`, the part of `mass` `[E, C]` at step t that is in the row of each decision."""
+        return (self.layout.sums(t) @ mass)[self.turns[t - 1].choice.rows]
 
     def ascend(
         self,
@@ -194,7 +197,7 @@ class Plans:
             turn, on = self.turns[t - 1], chances[t - 1]
             now = turn.back @ now
             gain = turn.choice.slope(now * self._gain(t, later, optimism), on)
-            come = (self.layout.sums(t) @ now)[turn.choice.rows]
+            come = self._come(t, now)
             net = gain - turn.price[:, None] * come
             found.append(np.divide(net, come, out=np.zeros_like(net), where=come > 0)[:, 0])
             now = self.missing(t, on, now)

@@ -20,7 +20,7 @@ from trackmdp.arrays.entries import per_row
 from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked_table
-from trackmdp.solvers.plans import Plans
+from trackmdp.solvers.plans import Layout, Plans
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.value import solved, visits_of
 from trackmdp.world.model import World
@@ -76,9 +76,7 @@ def risen(renewal: Renewal, policy: Found, plans: Plans, sets: Sequence[BoolArra
     and at last some rows alone: a few changes alter the visits little, so that their gains are those expected.
     """
     layout, old = plans.layout, policy.sets
-    moved = np.zeros(layout.count, dtype=bool)
-    for turn, before, after in zip(layout.turns, old, sets, strict=True):
-        moved[turn.choice.rows[before != after]] = True
+    moved = rows_changed(layout, old, sets)
     worth, other = (plans.worth(candidates_of(each))[:, 0] for each in (old, sets))
     gain = (other - worth) * _episodes(renewal, policy, plans)
     order = np.argsort(-gain, kind="stable")
@@ -89,14 +87,30 @@ def risen(renewal: Renewal, policy: Found, plans: Plans, sets: Sequence[BoolArra
             continue
         chosen = np.zeros(layout.count, dtype=bool)
         chosen[rows] = True
-        mixed = [
-            np.where(chosen[turn.choice.rows], after, before)
-            for turn, before, after in zip(layout.turns, old, sets, strict=True)
-        ]
-        tried = Found(renewal, mixed, policy)
+        tried = Found(renewal, mixed(layout, chosen, sets, old), policy)
         if tried.aihtr > policy.aihtr + policy.rounding:
             return tried
     return None
+
+
+def rows_changed(
+    layout: Layout, before: Sequence[BoolArray], after: Sequence[BoolArray]
+) -> BoolArray:
+    """`[K]`, the rows in which the sets differ."""
+    found = np.zeros(layout.count, dtype=bool)
+    for turn, old, new in zip(layout.turns, before, after, strict=True):
+        found[turn.choice.rows[old != new]] = True
+    return found
+
+
+def mixed(
+    layout: Layout, rows: BoolArray, these: Sequence[BoolArray], others: Sequence[BoolArray]
+) -> list[BoolArray]:
+    """`[G]` for each free choice: `these` sets in the `rows` `[K]` that are chosen, else the `others`."""
+    return [
+        np.where(rows[turn.choice.rows], this, other)
+        for turn, this, other in zip(layout.turns, these, others, strict=True)
+    ]
 
 
 def _tries(order: IndexArray, *, alone: bool) -> Iterator[IndexArray]:
