@@ -67,6 +67,21 @@ def test_starts_anywhere_are_all_points_that_have_a_next() -> None:
     assert sorted(env.reset()["last_cell"].tolist()) == [0, 1, 2, 3, 4, 5, 6, 7]
 
 
+@pytest.mark.parametrize(
+    ("anywhere", "max_steps", "begins"),
+    [(None, 2, "anywhere"), (None, None, "first"), (False, 2, "first"), (True, 2, "anywhere")],
+)
+def test_where_episodes_are_cut_they_begin_anywhere_unless_told(
+    anywhere: bool | None, max_steps: int | None, begins: str
+) -> None:
+    """Else what comes after the first `max_steps` of a track would not be learned from."""
+    problem = limited(recorded(TRACKS, anywhere=anywhere), max_steps)
+    starts = set(problem.sampled().first.tolist())
+    first = set(TRACKS.first[:-1].tolist())
+    assert starts == first if begins == "first" else starts > first
+    assert problem.sampled(held_out=True).first.tolist() == problem.held_out.first[:-1].tolist()
+
+
 @pytest.mark.parametrize("max_steps", [None, 2])
 @pytest.mark.parametrize("anywhere", [False, True])
 @pytest.mark.parametrize("num_envs", [1, 5])

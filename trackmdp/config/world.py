@@ -234,8 +234,9 @@ class TracksConfig(KernelConfig):
         "meaning of the end of a track: exit = the target left the grid, cut = the recording stopped",
         choices=("exit", "cut"),
     )
-    starts: str = option(
-        "start of episodes while learning: first = start of a track, anywhere = any recorded point",
+    starts: str | None = option(
+        "start of episodes while learning: first = start of a track, anywhere = any recorded point; null = anywhere "
+        "with grid.max_steps, so that what comes later is learned from too, else first",
         choices=("first", "anywhere"),
     )
     held_out: float = option(

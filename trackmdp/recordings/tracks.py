@@ -140,14 +140,15 @@ class Recorded(Task):
         tracks: those to learn from.
         validation: those to choose between policies by (best.pt, Optuna's trials); nothing learns from them.
         held_out: tracks to evaluate on at the end; no learner and no choice sees them.
-        anywhere: episodes begin at any recorded point, not only with a track.
+        anywhere: episodes to learn from begin at any recorded point, not only with a track; None: where `max_steps`
+            cuts them, since what comes later would not be learned from.
         loaded: counts of positions and tracks read, cut and dropped on the way from positions to the grid.
     """
 
     tracks: Tracks
     validation: Tracks
     held_out: Tracks
-    anywhere: bool
+    anywhere: bool | None
     loaded: Mapping[str, int]
 
     def __init__(
@@ -157,7 +158,7 @@ class Recorded(Task):
         *,
         validation: Tracks,
         held_out: Tracks,
-        anywhere: bool = False,
+        anywhere: bool | None = None,
         loaded: Mapping[str, int] | None = None,
         **of_task: Unpack[TaskOptions],
     ) -> None:
@@ -173,9 +174,13 @@ class Recorded(Task):
         parts["held out"] = self.held_out
         counts = ", ".join(f"{len(part):,} {name}" for name, part in parts.items())
         points = sum(len(part.cells) for part in parts.values())
-        begin = "at any point of a track" if self.anywhere else "with a track"
+        begin = "at any point of a track" if self._anywhere else "with a track"
         recording = {"tracks": counts, "points": f"{points:,}; episodes begin {begin}"}
         return super().facts() | recording
+
+    @property
+    def _anywhere(self) -> bool:
+        return self.max_steps is not None if self.anywhere is None else self.anywhere
 
     @property
     def model(self) -> None:
@@ -195,7 +200,7 @@ class Recorded(Task):
         """The tracks that targets follow: those to learn from, or on request the held-out ones, uncut."""
         if held_out:
             return self.held_out.motion()
-        return self.tracks.motion(anywhere=self.anywhere)
+        return self.tracks.motion(anywhere=self._anywhere)
 
     @property
     def selection(self) -> Recorded:

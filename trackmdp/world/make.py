@@ -236,7 +236,7 @@ def recorded(
     path: str,
     format: str | None,
     ends: str,
-    starts: str,
+    starts: str | None,
     held_out: float,
     validation: float,
     seed: int,
@@ -253,7 +253,8 @@ def recorded(
         UserError: the file is missing or malformed, a track is too short, or one of the three parts would be empty.
     """
     gridding = where | {name: others.pop(name) for name in ("step", "max_gap")}
-    of_task = others | {"markov": markov, "anywhere": starts == "anywhere"}
+    anywhere = None if starts is None else starts == "anywhere"
+    of_task = others | {"markov": markov, "anywhere": anywhere}
     # A located cell, t_max + 1 free choices and the forced step: t_max + 3 cells, the segment that hindsight learns
     # from.
     shortest = max(
