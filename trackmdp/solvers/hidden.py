@@ -18,7 +18,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers import optimal
 from trackmdp.solvers.annealing import anneal
-from trackmdp.solvers.exchange import best_of, exchanged, other_starts
+from trackmdp.solvers.exchange import exchanged, other_starts
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found, clocked_sets, follow_credit, mixed
 from trackmdp.solvers.solution import Solution
@@ -26,15 +26,15 @@ from trackmdp.solvers.value import averaged_kernel, value_of
 from trackmdp.world.model import World
 
 _STEPS, _SWEEPS = 12, 1
-_LED_EVENTS, _ANNEALED_EVENTS, _SHARED = 6_000, 10_000, 8
-_MOST_WORK, _CROSSED_WORK = 400_000, 3_000_000
+_LED_EVENTS, _ANNEALED_EVENTS, _SHARED = 10_000, 10_000, 8
+_MOST_WORK, _CROSSED_WORK = 400_000, 4_000_000
 """What bounds the time: events of all homotopies, and of all annealed policies; as how many an event or entry counts
 where sensors share cells; entries of the steps of all annealed policies, where these are more, and of crossed ones."""
 _ROUNDS = 20
 """Of exchange, for policies from which the best one is made: the first gain most, and where sensors share cells two."""
-_MOST_LED, _MOST_ANNEALED, _MOST_CROSSED, _ALIKE = 4, 6, 400, 1e-6
+_MOST_LED, _MOST_ANNEALED, _MOST_CROSSED, _ALIKE = 4, 6, 800, 1e-6
 """Other homotopies, annealed and crossed policies at most; and the relative difference up to which two count as one. On
-three by three cells crossing gains up to .001 a step, with the cell alone in memory and sensors that miss .003."""
+three by three cells crossing gains up to .003 a step."""
 
 _worth = attrgetter("aihtr")
 
@@ -69,12 +69,10 @@ def best_found(
     """
     renewal = Renewal(world, world.motion)
     pool = [_searched(renewal, each) for each in _starts(renewal, world, start, annealed)]
-    first, *others = sorted(pool, key=_worth, reverse=True)
-    best = best_of(renewal, first, [policy.sets for policy in others])
-    if others:
+    if len(pool) > 1:
         count = min(_CROSSED_WORK // _work(renewal), _MOST_CROSSED)
-        best = max(_crossed(renewal, [*pool, best], int(effort * count)), key=_worth)
-    return renewal.table(exchanged(renewal, best).sets)
+        pool = _crossed(renewal, pool, int(effort * count))
+    return renewal.table(exchanged(renewal, max(pool, key=_worth)).sets)
 
 
 def _searched(renewal: Renewal, policy: Found) -> Found:
@@ -82,20 +80,30 @@ def _searched(renewal: Renewal, policy: Found) -> Found:
 
 
 def _crossed(renewal: Renewal, pool: list[Found], count: int) -> list[Found]:
-    """A genetic search: `count` times exchange from the plans of one policy and of another, each key's by chance."""
+    """A genetic search: `count` times exchange from the plans of one policy and of another, each key's by chance.
+
+    In the first half a child takes the place of the parent that it is more like (crowding, Mahfoud 1995), so that the
+    policies stay different; then that of the policy of the least worth.
+    """
     rng = np.random.default_rng(derive(0, "hidden", "crossed"))
-    for _ in range(count):
+    for number in range(count):
         pool = sorted(pool, key=_worth, reverse=True)
         # The better one of two, and any other.
-        one, another = rng.integers(len(pool), size=2).min(), rng.integers(len(pool) - 1)
-        other = pool[another + (another >= one)]
+        one, another = int(rng.integers(len(pool), size=2).min()), int(rng.integers(len(pool) - 1))
+        another += another >= one
         taken = rng.random(len(renewal.plans)) < 0.5
-        sets = mixed(renewal.layout, taken, other.sets, pool[one].sets)
+        sets = mixed(renewal.layout, taken, pool[another].sets, pool[one].sets)
         child = _searched(renewal, Found(renewal, sets, pool[one]))
         # Policies of one worth are mostly the same.
         if not np.isclose(child.aihtr, [each.aihtr for each in pool], rtol=_ALIKE, atol=0.0).any():
-            pool[-1] = max(child, pool[-1], key=_worth)
+            like = min((one, another), key=lambda place: _differences(child, pool[place]))
+            place = like if number < count // 2 else -1
+            pool[place] = max(child, pool[place], key=_worth)
     return pool
+
+
+def _differences(one: Found, other: Found) -> int:
+    return sum(int((a != b).sum()) for a, b in zip(one.sets, other.sets, strict=True))
 
 
 def _starts(

@@ -80,9 +80,8 @@ class RenewalSystem:
             sparse.eye_array(transition.shape[0], format="csr") - transition
         )
         self.exact = transition.shape[0] <= direct
-        self._size, self._tolerance = size, tolerance
+        self._size, self._tolerance, self._full = size, tolerance, full
         if self.exact:
-            self._solve = _factorised(self._system, full)
             return
         diagonal = self._system.diagonal()
         self._precondition: Callable[[Array], Array] = (
@@ -121,6 +120,21 @@ class RenewalSystem:
         if not np.isfinite(total).all():
             raise UserError(_ENDLESS)
         return total
+
+    @cached_property
+    def _solve(self) -> Callable[[Array, bool], Array]:
+        return _factorised(self._system, self._full if self.exact else self._system.shape[0])
+
+    def changed(self, other: RenewalSystem, states: IndexArray) -> Array:
+        """`[m, m]` (T' - T)(I - T)^-1 between those `states` `[m]` in which the T' of another system differs from T.
+
+        With some C of them as in T' and the others as in T, the visits v of C are v (I - this)^-1, both for C alone
+        (Woodbury 1950). By a factorisation of the full matrix, also where single solutions are iterated.
+        """
+        units = np.zeros((self._system.shape[0], len(states)), order="F")
+        units[states, np.arange(len(states))] = 1.0
+        change: Array = (self._system[states] - other._system[states]) @ self._solve(units, False)
+        return change
 
     @cached_property
     def _turned(self) -> RenewalSystem:
