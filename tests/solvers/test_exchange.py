@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -175,3 +177,27 @@ def test_without_a_free_choice_after_the_first_there_is_nothing_to_exchange() ->
     world = make_world("drift", size=5, cost=0.2, t_max=0)
     table = search.solve(world)
     assert (exchange.solve(world).sets != table.sets).nnz == 0
+
+
+@pytest.mark.parametrize("options", [{}, {"safe_detection": 0.7, "detection": 0.8}])
+def test_of_new_plans_those_are_taken_that_gain_after_the_ones_before(options: Any) -> None:
+    """Where modes are hidden a better plan may lower the AIHTR: each key's gain, against whole evaluations."""
+    world = make_world("heading", size=3, memory="displacement").but(**options)
+    renewal = Renewal(world, world.motion)
+    policy = search.follow_credit(
+        renewal, world, Found(renewal, search.clocked_sets(renewal, world)), 3, 1
+    )
+    plans = renewal.problem(policy.value, search.shares(renewal, policy))
+    every = np.ones(len(renewal.plans), dtype=bool)
+    sets = exchange.exchange(plans, policy.sets, every)
+    order = np.random.default_rng(0).permutation(len(renewal.plans))
+    order = order[search.rows_changed(plans.layout, policy.sets, sets)[order]]
+    taken = search._gaining(renewal, policy, sets, order)
+    assert 0 < len(taken) < len(order)
+    now, rows = policy, np.zeros(len(renewal.plans), dtype=bool)
+    for row in order:
+        rows[row] = True
+        tried = Found(renewal, search.mixed(plans.layout, rows, sets, policy.sets))
+        assert (tried.aihtr > now.aihtr + policy.rounding) == (row in taken)
+        rows[row] = row in taken
+        now = tried if row in taken else now

@@ -93,25 +93,43 @@ def test_a_child_has_the_plans_of_two(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before exchange, about half of the keys' plans are those of each; the worst policy leaves the pool."""
     world = headings(3, 0.7, cost=0.12, memory="displacement")
     renewal, begun = Renewal(world, world.motion), list[Found]()
+    rng = np.random.default_rng(0)
     every, none = ([np.full(len(c.rows), on) for c in renewal.choices] for on in (True, False))
     better = exchange.exchanged(renewal, Found(renewal, none))
     monkeypatch.setattr(hidden, "exchanged", lambda *a, **_: begun.append(a[1]) or better)
-    pool = hidden._crossed(renewal, [Found(renewal, every), Found(renewal, none)], 1)
+    pool = hidden._crossed(renewal, [Found(renewal, every), Found(renewal, none)], 1, rng)
     rows, on = renewal.choices[0].rows, begun[0].sets[0]
     share = [on[rows == row].mean() for row in np.unique(rows)]
     assert set(share) == {0.0, 1.0}
     assert 0.3 < np.mean(share) < 0.7
     assert [each.aihtr for each in pool][-1] == better.aihtr
-    again = hidden._crossed(renewal, pool, 3)  # it is known
+    again = hidden._crossed(renewal, pool, 3, rng)  # it is known
     assert sum(each is better for each in again) == 1
+
+
+def test_a_child_takes_the_place_of_the_parent_that_it_is_like(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In the first half; then that of the policy of the least worth."""
+    world = headings(3, 0.7, cost=0.12, memory="displacement")
+    renewal = Renewal(world, world.motion)
+    low, middle, child = (
+        Found(renewal, [np.arange(len(choice.rows)) % 4 < on for choice in renewal.choices])
+        for on in (0, 1, 3)
+    )
+    assert low.aihtr < middle.aihtr < child.aihtr
+    monkeypatch.setattr(hidden, "exchanged", lambda *a, **_: child)
+    for count, stays in ((2, low), (1, middle)):
+        pool = hidden._crossed(renewal, [low, middle], count, np.random.default_rng(0))
+        assert {id(each) for each in pool} == {id(stays), id(child)}
 
 
 def test_less_effort_crosses_fewer_policies(monkeypatch: pytest.MonkeyPatch) -> None:
     world, crossed = make_world("heading", size=3), list[int]()
-    monkeypatch.setattr(hidden, "_crossed", lambda _, pool, count: crossed.append(count) or pool)
+    monkeypatch.setattr(hidden, "_crossed", lambda *a: crossed.append(a[2]) or a[1])
     for effort in (1.0, 0.5, 0.0):
         hidden.best_found(world, effort=effort)
-    assert crossed == [400, 200, 0]
+    assert crossed == [199, 199, 199, 199, 199, 199]
 
 
 def test_where_a_search_takes_long_some_are_annealed_in_place_of_homotopies(

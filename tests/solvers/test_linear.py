@@ -131,3 +131,30 @@ def test_a_level_below_a_level_gives_the_same_solution(
     np.testing.assert_allclose(system.solve(gathered), expected, rtol=1e-10)
     assert isinstance(system._precondition._below, linear._Level)
     assert system._precondition._below._below is None
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 2**31), st.integers(2, 12), st.integers(0, 700))
+def test_visits_of_a_part_of_the_changes_are_those_of_the_mixed_system(
+    seed: int, states: int, direct: int
+) -> None:
+    """The gain of any of the states that change, solved for among these alone."""
+    rng = np.random.default_rng(seed)
+    before, after = (random_kernel(rng, states, 0.1) for _ in range(2))
+    moved = np.flatnonzero(rng.random(states) < 0.7)
+    after[np.setdiff1d(np.arange(states), moved)] = before[np.setdiff1d(np.arange(states), moved)]
+    old, new = (
+        RenewalSystem(sparse.csr_array(each), (1, states), direct=direct)
+        for each in (before, after)
+    )
+    change = np.eye(len(moved)) - old.changed(new, moved)
+    start, earned, more = rng.random(states), rng.random(states), rng.random(states)
+    value, visits = old.solve(earned), old.solve(start, transposed=True)
+    some = np.flatnonzero(rng.random(len(moved)) < 0.5)
+    here = moved[some]
+    mixed, paid = before.copy(), earned.copy()
+    mixed[here], paid[here] = after[here], more[here]
+    gain = (more + after @ value - value)[here]
+    expected = start @ np.linalg.solve(np.eye(states) - mixed, paid) - start @ value
+    found = visits[here] @ np.linalg.solve(change[np.ix_(some, some)], gain)
+    assert found == pytest.approx(expected, rel=1e-7, abs=1e-7)

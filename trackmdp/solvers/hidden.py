@@ -32,9 +32,9 @@ _MOST_WORK, _CROSSED_WORK = 400_000, 4_000_000
 where sensors share cells; entries of the steps of all annealed policies, where these are more, and of crossed ones."""
 _ROUNDS = 20
 """Of exchange, for policies from which the best one is made: the first gain most, and where sensors share cells two."""
-_MOST_LED, _MOST_ANNEALED, _MOST_CROSSED, _ALIKE = 4, 6, 800, 1e-6
-"""Other homotopies, annealed and crossed policies at most; and the relative difference up to which two count as one. On
-three by three cells crossing gains up to .003 a step."""
+_MOST_LED, _MOST_ANNEALED, _MOST_CROSSED, _MOST_AT_ONCE, _ALIKE = 4, 6, 800, 200, 1e-6
+"""Other homotopies, annealed and crossed policies at most; crossed ones of one search, which more do not improve; and
+the relative difference up to which two count as one. On three by three cells crossing gains up to .003 a step."""
 
 _worth = attrgetter("aihtr")
 
@@ -70,8 +70,10 @@ def best_found(
     renewal = Renewal(world, world.motion)
     pool = [_searched(renewal, each) for each in _starts(renewal, world, start, annealed)]
     if len(pool) > 1:
-        count = min(_CROSSED_WORK // _work(renewal), _MOST_CROSSED)
-        pool = _crossed(renewal, pool, int(effort * count))
+        count = int(effort * min(_CROSSED_WORK // _work(renewal), _MOST_CROSSED))
+        times = -(-count // _MOST_AT_ONCE)
+        rng = np.random.default_rng(derive(0, "hidden", "crossed"))
+        pool += [one for _ in range(times) for one in _crossed(renewal, pool, count // times, rng)]
     return renewal.table(exchanged(renewal, max(pool, key=_worth)).sets)
 
 
@@ -79,13 +81,14 @@ def _searched(renewal: Renewal, policy: Found) -> Found:
     return exchanged(renewal, policy, rounds=_ROUNDS // _slower(renewal), exact=False)
 
 
-def _crossed(renewal: Renewal, pool: list[Found], count: int) -> list[Found]:
+def _crossed(
+    renewal: Renewal, pool: list[Found], count: int, rng: np.random.Generator
+) -> list[Found]:
     """A genetic search: `count` times exchange from the plans of one policy and of another, each key's by chance.
 
     In the first half a child takes the place of the parent that it is more like (crowding, Mahfoud 1995), so that the
     policies stay different; then that of the policy of the least worth.
     """
-    rng = np.random.default_rng(derive(0, "hidden", "crossed"))
     for number in range(count):
         pool = sorted(pool, key=_worth, reverse=True)
         # The better one of two, and any other.
