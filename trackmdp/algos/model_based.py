@@ -50,7 +50,7 @@ _SAMPLES = 8
 """Kernels drawn for the uncertainty reported."""
 _MOST_CELLS = 1_600
 """Cells up to which plans of pooled moves are tried beside those of paths."""
-_MODES, _MOST_STATES, _ANNEALED, _EFFORT = 12, 500, 2, 0.7
+_MODES, _MOST_STATES, _ANNEALED, _EFFORT = 12, 500, 2, 0.35
 """Hidden modes of the motion that is fitted as well, up to so many pairs of a cell and a mode; and in the search for
 its plan the policies that are annealed at least, and the effort. With six modes plans for nine velocities end .04 a
 step lower."""
