@@ -39,7 +39,7 @@ def frames(
     max_steps: int | None = None,
 ) -> Any:
     return collect(
-        setting := recorded(by_hand(*tracks, exits=exits)),
+        setting := recorded(by_hand(*tracks, exits=exits), anywhere=False),
         Policy.all_on(setting),
         envs,
         time,

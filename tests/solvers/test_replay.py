@@ -118,7 +118,9 @@ def test_figures_are_those_of_the_environment(
     rng = np.random.default_rng(seed)
     tracks = drawn(small_world(seed=seed).kernel, 30, seed)
     tracks = replace(tracks, exits=rng.random(30) < 0.7).select(tracks.lengths > 1)
-    setting = replace(recorded(tracks, t_max=t_max), cost=rng.random(9), safe_cost=0.7)
+    setting = replace(
+        recorded(tracks, t_max=t_max, anywhere=False), cost=rng.random(9), safe_cost=0.7
+    )
     chains = rng.random((9, t_max + 1, 9)) < density
     ours = replayed(setting, tracks.limited(max_steps), chains)
     stepped = in_the_environment(setting, chains, max_steps)
