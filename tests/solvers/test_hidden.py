@@ -80,7 +80,7 @@ def test_what_is_found_is_no_worse_than_the_start(monkeypatch: pytest.MonkeyPatc
     """One homotopy ends lower than all searches; begun from their policy it ends no lower than that."""
     world = make_world("heading", size=3, memory="cell").but(detection=0.8)
     best = hidden.best_found(world, effort=0.1)
-    for limit in ("_LED_EVENTS", "_ANNEALED_EVENTS", "_MOST_WORK", "_MOST_CROSSED"):
+    for limit in ("_MORE_EVENTS", "_MOST_WORK", "_MOST_CROSSED"):
         monkeypatch.setattr(hidden, limit, 0)
     least, kept, again = (
         evaluate(world, policy).aihtr
@@ -136,7 +136,7 @@ def test_where_a_search_takes_long_some_are_annealed_in_place_of_homotopies(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world, begun = make_world("heading", size=3), list[str]()
-    for limit in ("_LED_EVENTS", "_ANNEALED_EVENTS", "_MOST_WORK"):
+    for limit in ("_MORE_EVENTS", "_MOST_WORK"):
         monkeypatch.setattr(hidden, limit, 0)
     for name in ("follow_credit", "anneal"):
         made = getattr(hidden, name)

@@ -26,10 +26,11 @@ from trackmdp.solvers.value import averaged_kernel, value_of
 from trackmdp.world.model import World
 
 _STEPS, _SWEEPS = 12, 1
-_LED_EVENTS, _ANNEALED_EVENTS, _SHARED = 10_000, 10_000, 8
+_MORE_EVENTS, _SHARED = 10_000, 8
 _MOST_WORK, _CROSSED_WORK = 400_000, 4_000_000
-"""What bounds the time: events of all homotopies, and of all annealed policies; as how many an event or entry counts
-where sensors share cells; entries of the steps of all annealed policies, where these are more, and of crossed ones."""
+"""What bounds the time: events of all homotopies, and as many of all annealed policies; as how many an event or entry
+counts where sensors share cells; entries of the steps of all annealed policies, where these are more, and of crossed
+ones."""
 _ROUNDS = 20
 """Of exchange, for policies from which the best one is made: the first gain most, and where sensors share cells two."""
 _MOST_LED, _MOST_ANNEALED, _MOST_CROSSED, _MOST_AT_ONCE, _ALIKE = 4, 6, 800, 200, 1e-6
@@ -115,15 +116,12 @@ def _starts(
     """Policies to search from: a known one, those of homotopies, and annealed ones."""
     if start is not None:
         yield Found(renewal, renewal.sets(start))
-    led, more = (
-        max(most // (_slower(renewal) * renewal.count) - 1, 0)
-        for most in (_LED_EVENTS, _ANNEALED_EVENTS)
-    )
+    more = max(_MORE_EVENTS // (_slower(renewal) * renewal.count) - 1, 0)
     many = _MOST_WORK // _work(renewal)
     if many or not least:
         first = Found(renewal, clocked_sets(renewal, world))
         yield follow_credit(renewal, world, first, _STEPS, _SWEEPS)
-        for sets in other_starts(renewal, world, min(led, _MOST_LED), _STEPS, _SWEEPS):
+        for sets in other_starts(renewal, world, min(more, _MOST_LED), _STEPS, _SWEEPS):
             yield Found(renewal, sets)
     rng = np.random.default_rng(derive(0, "hidden", "annealed"))
     for place in range(min(max(more, many, least), _MOST_ANNEALED)):

@@ -11,6 +11,7 @@ lower it for some events, so that a step is kept only if the AIHTR, which is exa
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 
@@ -19,6 +20,7 @@ import numpy as np
 from trackmdp.arrays.entries import per_row
 from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
 from trackmdp.policies.table import PolicyTable
+from trackmdp.recordings.tracks import ends_of
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.plans import Layout, Plans
 from trackmdp.solvers.renewal import Renewal
@@ -81,6 +83,8 @@ def risen(renewal: Renewal, policy: Found, plans: Plans, sets: Sequence[BoolArra
     """
     layout, old = plans.layout, policy.sets
     moved = rows_changed(layout, old, sets)
+    if not moved.any():
+        return None
     worth, other = (plans.worth(candidates_of(each))[:, 0] for each in (old, sets))
     gain = (other - worth) * _episodes(renewal, policy, plans)
     order = np.argsort(-gain, kind="stable")
@@ -112,16 +116,14 @@ def _gaining(
     assert policy.visits is not None
     owner = renewal.owner[: renewal.count - renewal.events.forced]
     events = [np.flatnonzero(owner == row) for row in order]
-    states = np.concatenate([np.zeros(0, dtype=np.int64), *events])
+    states = np.concatenate(events)
     system, earned = renewal.system(sets)
     visits, most = policy.visits[states], policy.rounding
     gain = system.residual(earned, policy.value)[states]
     change = np.eye(len(states)) - policy.system.changed(system, states)
     taken = np.zeros(len(order), dtype=bool)
-    ends = np.cumsum([len(each) for each in events])
-    for place, (low, high) in enumerate(
-        zip(ends - [len(each) for each in events], ends, strict=True)
-    ):
+    ends = ends_of(np.array([len(each) for each in events]))
+    for place, (low, high) in enumerate(itertools.pairwise(ends)):
         here, later = slice(low, high), slice(high, None)
         inverse = np.linalg.inv(change[here, here])
         if visits[here] @ inverse @ gain[here] > most:
@@ -155,8 +157,6 @@ def mixed(
 
 def _tries(order: IndexArray, *, alone: bool) -> Iterator[IndexArray]:
     """All rows of `order`; with `alone` then the first half, quarter, ... of them, and some by themselves."""
-    if not len(order):
-        return
     yield order
     if alone:
         yield from (order[: len(order) >> half] for half in range(1, len(order).bit_length()))
