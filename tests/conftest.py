@@ -7,6 +7,9 @@ import os
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# Ray's workers run at the lowest priority but four: beside other tests that use all cores they would take minutes to
+# start.
+os.environ.setdefault("RAY_worker_niceness", "0")
 
 import pytest
 import torch

@@ -16,6 +16,7 @@ from tests.helpers import train_config
 from tests.training.runs import at_iteration, rows
 from trackmdp.app.commands.train import run
 from trackmdp.errors import RunError, UserError
+from trackmdp.training import on_ray
 from trackmdp.training.on_ray import _Collector
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own, of many kinds
@@ -70,6 +71,29 @@ def test_a_node_that_is_lost_while_weights_are_sent_is_named(
         _Collector.__new__(_Collector).update_policy_weights_()
 
 
+def test_workers_that_do_not_start_keep_no_cores(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Waited:
+        def __init__(self, *_: object, **__: object) -> None:
+            self.ended = False
+            made.append(self)
+
+        def update_policy_weights_(self) -> None:
+            raise RuntimeError("wait timeout after 60000ms\nkeys: 1")
+
+        def shutdown(self) -> None:
+            self.ended = True
+
+    made: list[Waited] = []
+    monkeypatch.setattr(on_ray, "_Collector", Waited)
+    with pytest.raises(
+        RunError, match=r"^collector=ray: a worker did not start \(wait timeout after 60000ms\)$"
+    ):
+        run(train_config(*WORDS.split()), tmp_path)
+    assert [each.ended for each in made] == [True]
+
+
 @pytest.mark.long
 def test_a_cluster_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="expected a Ray cluster"):
@@ -77,7 +101,15 @@ def test_a_cluster_that_is_not_there_is_refused(tmp_path: Path) -> None:
 
 
 def _is_worker(process: Path) -> bool:
+    """Of the cluster that this process has started."""
     try:
-        return re.match(rb"ray::\w*Collector", (process / "cmdline").read_bytes()) is not None
+        named = re.match(rb"ray::\w*Collector", (process / "cmdline").read_bytes())
+        return named is not None and _parent(_parent(int(process.name))) == os.getpid()
     except OSError:
         return False
+
+
+def _parent(process: int) -> int:
+    return int(
+        re.findall(r"^PPid:\t(\d+)$", Path(f"/proc/{process}/status").read_text(), re.MULTILINE)[0]
+    )

@@ -16,7 +16,7 @@ from torchrl.collectors.distributed import RayCollector
 from trackmdp.cluster import joining, ray_options
 from trackmdp.config.learning import RayWorkersConfig
 from trackmdp.environment.env import TrackEnv
-from trackmdp.errors import message_of, require
+from trackmdp.errors import RunError, message_of, require
 from trackmdp.training.collect import MakeEnv, of_workers, own_env
 
 _STORE = 2**30
@@ -34,6 +34,7 @@ def ray(
 
     Raises:
         UserError: Ray is not installed, or there is no such cluster.
+        RunError: a worker did not start.
     """
     require("ray", "ray", "collector=ray")
     # RayCollector has no such argument; the collectors that it makes in its workers have.
@@ -52,7 +53,11 @@ def ray(
             postproc=_rows,
             **common,
         )
-    made.update_policy_weights_()
+    try:
+        made.update_policy_weights_()
+    except RuntimeError as error:  # TorchRL waits a minute for each of them
+        made.shutdown()  # else they would keep their cores of a cluster that goes on
+        raise RunError(f"collector=ray: a worker did not start ({message_of(error)})") from error
     return made
 
 
