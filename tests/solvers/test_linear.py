@@ -15,7 +15,7 @@ from trackmdp.motion.kernels import random_walk
 from trackmdp.solvers import linear, renewal, rules, value
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.linear import RenewalSystem, accumulate, expected_steps
+from trackmdp.solvers.linear import Levels, RenewalSystem, accumulate, expected_steps
 from trackmdp.solvers.optimal import solve
 from trackmdp.world.model import World
 
@@ -43,6 +43,23 @@ def test_the_iteration_solves_what_the_factorisation_solves(
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-8 * longest)
     np.testing.assert_allclose(accumulate(transition, gathered), exact, rtol=0, atol=1e-8 * longest)
     assert (iterated.upper(gathered[:, 0], longest) >= exact[:, 0] - 1e-12 * longest).all()
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 2**31), st.integers(1, 6), st.booleans(), st.booleans())
+def test_level_by_level_and_event_by_event_solve_the_system(
+    seed: int, count: int, transposed: bool, one_by_one: bool
+) -> None:
+    """Some levels with no event among them."""
+    rng = np.random.default_rng(seed)
+    level = rng.integers(count, size=12)
+    later = (level[:, None] < level) * (rng.random((12, 12)) < 0.5)
+    moves, gathered = later * rng.random((12, 12)), rng.standard_normal((12, 2))
+    system = moves.T if transposed else moves
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(linear, "_FEWEST", 13 if one_by_one else 0)
+        found = Levels(level).solve(sparse.csr_array(moves), gathered, transposed=transposed)
+    np.testing.assert_allclose(found, np.linalg.solve(np.eye(12) - system, gathered), rtol=1e-9)
 
 
 def test_long_episodes_take_few_products(monkeypatch: pytest.MonkeyPatch) -> None:

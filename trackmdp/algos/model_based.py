@@ -20,7 +20,7 @@ from tensordict import TensorDictBase
 
 from trackmdp.algos.common import arrays, known_alone, lifted, located, tensors
 from trackmdp.algos.estimates.alike import cell_classes
-from trackmdp.algos.estimates.hidden_modes import with_modes
+from trackmdp.algos.estimates.hidden_modes import Fit, fit_modes
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.estimates.path_counts import plan_paths
 from trackmdp.algos.estimates.path_gains import Paths, thinned
@@ -84,6 +84,7 @@ class ModelBased:
         on_paths = ("keys_seen", "reward_per_move")
         self._found = dict.fromkeys(beliefs if by == "moves" else on_paths, math.nan)
         self._before: PolicyTable | None = None
+        self._fit: Fit | None = None
         self.actor = Policy.all_on(task)
         self.policy = RenewedTable(task, device, on=True) if self._chooses else Policy.all_on(task)
 
@@ -173,8 +174,9 @@ class ModelBased:
 
     def _with_modes(self, tracks: Tracks, before: PolicyTable | None) -> PolicyTable:
         """The plan for a target with hidden modes."""
-        seed = derive(self._seed, "modes")
-        world = with_modes(self.task, tracks, _MODES, self._least, seed)
+        seed, earlier = derive(self._seed, "modes"), None if before is None else self._fit
+        self._fit = fit_modes(tracks, self.task.num_cells, _MODES, seed, earlier)
+        world = self._fit.world(self.task, self._least)
         if before is not None:
             return exchange.improve(world, before)
         return hidden.best_found(world, annealed=_ANNEALED, effort=_EFFORT)

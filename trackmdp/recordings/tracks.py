@@ -50,6 +50,11 @@ class Tracks:
         """`[K]` cells of each track."""
         return np.diff(self.first)
 
+    @property
+    def places(self) -> Indices:
+        """`[P]`, place of each point in its own track: tracks of 3 and 2 cells count 0 1 2 0 1."""
+        return np.arange(len(self.cells)) - np.repeat(self.first[:-1], self.lengths)
+
     def select(self, chosen: BoolArray) -> Tracks:
         """The tracks for which `chosen` `[K]` holds."""
         lengths = self.lengths
@@ -64,13 +69,11 @@ class Tracks:
         if max_steps is None:
             return self
         lengths = self.lengths
-        # Place in its own track of each point: tracks of 3 and 2 cells count 0 1 2 0 1.
-        step = np.arange(len(self.cells)) - np.repeat(self.first[:-1], lengths)
         # max_steps moves have max_steps + 1 cells. A track cut short has no exit any more; one of max_steps + 1 cells
         # leaves on a step too many.
         kept = np.minimum(lengths, max_steps + 1)
         return Tracks(
-            self.cells[step <= max_steps],
+            self.cells[self.places <= max_steps],
             ends_of(kept),
             self.exits & (lengths <= max_steps),
             self.names,

@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from functools import cached_property, lru_cache
+from itertools import pairwise
 
 import numpy as np
 from scipy import sparse
@@ -20,6 +21,7 @@ from scipy.sparse.linalg import splu, spsolve_triangular
 from trackmdp.arrays.entries import short_indices, summing
 from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.errors import UserError
+from trackmdp.recordings.tracks import ends_of
 from trackmdp.world.model import World
 
 DIRECT_CELLS = 20_000
@@ -38,6 +40,8 @@ _LAST_BITS = 4.0 * float(np.finfo(np.float64).eps)
 # Where some cells have no way out, I - P is singular; if rounding lets the solve pass, lengths come out negative or
 # about 1 / 1e-16. No kernel that is meant to end comes near 1e12 steps.
 _LONGEST_EPISODE = 1e12
+# Events a level, on average, from which a pass over the levels is the faster one, up to twice as fast.
+_FEWEST = 1_000
 _ENDLESS = (
     "kernel: from some cell the target never exits, so no value is finite: "
     "expected an exit reachable from each cell"
@@ -341,18 +345,44 @@ def summed_over(moves: sparse.csr_array, gathered: Array, steps: int) -> Array:
     return found
 
 
-def triangular(
-    transition: sparse.csr_array, gathered: Array, order: IndexArray, *, transposed: bool = False
-) -> Array:
-    """`[B]` or `[B, K]`, v = gathered + transition v, where in this `order` `[B]` each event leads to later ones alone.
+class Levels:
+    """Solves ``v = gathered + transition v`` where each event leads to events of higher levels alone.
 
-    `transposed`: v = gathered + transition^T v.
+    All events of a level are found together, from those above it.
+
+    Args:
+        level: `[B]`, of each event.
     """
-    sorted_ = transition[order][:, order]
-    system = sparse.eye_array(len(order), format="csr") - (sorted_.T if transposed else sorted_)
-    found = np.empty_like(gathered)
-    found[order] = spsolve_triangular(system, gathered[order], lower=transposed, unit_diagonal=True)
-    return found
+
+    def __init__(self, level: IndexArray) -> None:
+        self._order = np.argsort(level, kind="stable")
+        self._first = ends_of(np.bincount(level))
+
+    def solve(
+        self, transition: sparse.csr_array, gathered: Array, *, transposed: bool = False
+    ) -> Array:
+        """`[B]` or `[B, K]` v; `transposed`: v = gathered + transition^T v."""
+        if len(self._order) < _FEWEST * len(self._first):
+            return self._one_by_one(transition, gathered, transposed)
+        # What is above comes first; of the transposed matrix, in which events follow from lower levels, what is below.
+        levels = list(pairwise(self._first))[:: 1 if transposed else -1]
+        sorted_ = (transition.T.tocsr() if transposed else transition)[self._order]
+        found = gathered.copy()
+        for begin, end in levels:
+            found[self._order[begin:end]] += sorted_[begin:end] @ found
+        return found
+
+    def _one_by_one(self, transition: sparse.csr_array, gathered: Array, transposed: bool) -> Array:
+        sorted_ = transition[self._order][:, self._order]
+        system = sparse.eye_array(len(gathered), format="csr") - sorted_
+        found = np.empty_like(gathered)
+        found[self._order] = spsolve_triangular(
+            system.T if transposed else system,
+            gathered[self._order],
+            lower=transposed,
+            unit_diagonal=True,
+        )
+        return found
 
 
 def check_length(steps: Array) -> None:

@@ -28,12 +28,12 @@ from trackmdp.solvers.evaluation import Evaluation, ReplayedTracks, by_start, po
 from trackmdp.solvers.linear import (
     DIRECT_CELLS,
     TOLERANCE,
+    Levels,
     RenewalSystem,
     accumulate,
     check_length,
     expected_steps,
     still_to_come,
-    triangular,
 )
 from trackmdp.solvers.walk import Events, Passed, Walk, all_events, passed
 from trackmdp.world.model import World
@@ -168,7 +168,7 @@ def _whole_episodes(
 
 def whole_renewals(steps: Iterable[Passed], count: int) -> tuple[sparse.csr_array, Array]:
     """K `[B, B]` and `[B, 6]` totals of whole renewals."""
-    located, gathered = sparse.csr_array((count, count)), np.zeros((count, 6))
+    located, gathered = sparse.csr_array((count, count)), np.zeros((6, count)).T
     for step in steps:
         located = located + step.located
         gathered += step.totals
@@ -276,17 +276,17 @@ def key_visits(problem: Problem, policy: PolicyTable) -> Array:
 def replay(task: Task, tracks: Tracks, policy: PolicyTable) -> ReplayedTracks:
     """Follow `policy` along every recorded track, from its first cell.
 
-    A renewal leads to later points alone, so that its system is triangular in the order of the points.
+    A renewal leads to later points of its track alone.
     """
     motion = tracks.motion()
     events, found = follow(task, motion, policy)
     steps, count = list(found), len(events.codes)
     located, gathered = whole_renewals(steps, count)
-    order = np.argsort(events.state, kind="stable")
-    totals = triangular(located, gathered, order)
+    levels = Levels(tracks.places[events.state])
+    totals = levels.solve(located, gathered)
     first = first_events(events, motion)
     start = np.bincount(first, minlength=count).astype(np.float64)
-    visits = triangular(located, start, order, transposed=True)
+    visits = levels.solve(located, start, transposed=True)
     # How often each row of the policy's table was used, key by key and n by n.
     used = np.zeros((policy.task.num_keys, task.num_choices))
     for n, step in enumerate(steps[:-1]):

@@ -9,7 +9,8 @@ import pytest
 
 import trackmdp as tm
 from tests.tracks import by_hand
-from trackmdp.algos.estimates.hidden_modes import _Paths, with_modes
+from trackmdp.algos.estimates import hidden_modes
+from trackmdp.algos.estimates.hidden_modes import _Paths, fit_modes
 from trackmdp.recordings.tracks import Tracks
 
 TASK = tm.World(np.full((3, 3), 0.3), (1, 3), cost=0.16, t_max=1, memory="displacement")
@@ -91,10 +92,24 @@ def test_exits_are_not_spared_and_lead_to_no_mode() -> None:
 
 def test_a_target_that_keeps_its_heading_is_predicted_from_its_last_move() -> None:
     """From 0 to 1, then on to 3 with probability .9, back to 0 with .1; half and half by the cell alone."""
-    world = with_modes(square(), around(300, 40, 1), 2, 0.0, seed=0)
+    world = fit_modes(around(300, 40, 1), 4, 2, seed=0).world(square(), 0.0)
     kernel = world.kernel.toarray().reshape(4, 2, 4, 2)
     then = kernel[0, :, 1].sum(axis=0) @ kernel[1].sum(axis=2)
     assert then[3] / then.sum() == pytest.approx(KEPT, abs=0.03)
+
+
+def test_of_more_tracks_an_earlier_fit_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Among them a move, from 0 to 3, that the earlier tracks did not show."""
+    tracks = around(300, 40, 1)
+    before = fit_modes(tracks, 4, 2, seed=0)
+    monkeypatch.setattr(hidden_modes, "_guessed", None)
+    more = by_hand(*np.split(tracks.cells, tracks.first[1:-1]), *[[0, 3]] * 9, exits=False)
+    again = fit_modes(more, 4, 2, seed=0, before=before).world(square(), 0.0)
+    kernel = again.kernel.toarray().reshape(4, 2, 4, 2)
+    then = kernel[0, :, 1].sum(axis=0) @ kernel[1].sum(axis=2)
+    assert then[3] / then.sum() == pytest.approx(KEPT, abs=0.03)
+    assert kernel[0, :, 3].sum() > 0
+    assert (before.world(square(), 0.0).kernel.toarray().reshape(4, 2, 4, 2)[0, :, 3] == 0).all()
 
 
 def square() -> tm.World:
@@ -103,7 +118,7 @@ def square() -> tm.World:
 
 
 def test_every_move_that_was_seen_stays_possible_and_exits_are_left_over() -> None:
-    world = with_modes(TASK, TRACKS, 3, 0.0, seed=0)
+    world = fit_modes(TRACKS, 3, 3, seed=0).world(TASK, 0.0)
     assert (world.modes, world.memory, world.max_steps) == (3, "displacement", None)
     chance = world.kernel.toarray().reshape(3, 3, 3, 3).sum(axis=(1, 3))
     assert {*zip(*np.nonzero(chance), strict=True)} == {*PAIRS[:-1]}
@@ -112,14 +127,12 @@ def test_every_move_that_was_seen_stays_possible_and_exits_are_left_over() -> No
 
 
 def test_of_recordings_of_one_cell_each_the_target_leaves_at_once() -> None:
-    world = with_modes(TASK, by_hand([0], [1], exits=False), 2, 0.0, seed=0)
+    world = fit_modes(by_hand([0], [1], exits=False), 3, 2, seed=0).world(TASK, 0.0)
     assert world.kernel.nnz == 0
 
 
 def test_the_seed_is_all_that_is_random() -> None:
-    one, same, other = (
-        with_modes(TASK, TRACKS, 3, 0.0, seed=seed).kernel.toarray() for seed in (0, 0, 1)
-    )
+    one, same, other = (fit_modes(TRACKS, 3, 3, seed=seed).moves for seed in (0, 0, 1))
     assert (one == same).all()
     assert not (one == other).all()
 

@@ -153,6 +153,22 @@ def test_the_choice_is_the_one_that_earns_most_where_it_is_judged() -> None:
         )
 
 
+@pytest.mark.parametrize(
+    ("earned", "searched"),
+    [
+        ([0.995, 1.0], [0, 1]),
+        ([1.0, 0.98], [0]),
+        ([-1.02, -1.0], [1]),
+        ([-1.0, -1.005], [0, 1]),
+        ([0.0], [0]),
+    ],
+)
+def test_exchange_begins_from_plans_that_may_end_as_the_best(
+    earned: list[float], searched: list[int]
+) -> None:
+    assert path_plans._near(np.array(earned)) == searched
+
+
 def test_another_plan_that_is_chosen_is_made_of_all_paths_and_left_as_it_is() -> None:
     """The quarter of the paths that judges goes where the others do not: what is counted would change the plan."""
     _, judge = parted(by_hand(*[[0, 1]] * 8), 3)

@@ -28,6 +28,8 @@ modes the others end up to .04 a move below them."""
 _ROUNDS, _MOST, _LONGEST = 45, 200_000, 100
 """Rounds after them, and moves: with twelve modes a round takes a tenth of a second. All paths take a step at once, and
 longer ones are cut."""
+_AGAIN = 15
+"""Rounds from an earlier fit, which most of the paths have made."""
 _FREE, _SPARED = 10, 2e-5
 """Rounds until few modes shall follow each other: from then on each expected number of moves counts as less by this
 share of all moves (a Dirichlet prior below 1), so that most become none and the solver has fewer entries."""
@@ -37,30 +39,51 @@ _FLOOR = 0.01
 """Moves of each pair of cells that are always counted, so that no path becomes impossible."""
 
 
-def with_modes(task: Task, tracks: Tracks, modes: int, least: float, seed: int) -> World:
-    """The task with a target that has hidden modes, as the tracks show it to move.
+@dataclass(frozen=True)
+class Fit:
+    """A target with hidden modes, as some paths show it to move.
+
+    Attributes:
+        paths: moves, a part of them where there are many.
+        moves: the motion, for each pair of cells.
+    """
+
+    paths: _Paths
+    moves: Array
+
+    def world(self, task: Task, least: float) -> World:
+        """A task with that target; moves less likely than `least` are left out."""
+        paths, modes = self.paths, self.moves.shape[1]
+        # Half an exit in one more move, as of pooled moves: on recordings that all stop no episode would end.
+        moves = self.moves * (1.0 - 0.5 / (paths.count + 1))
+        pair, mode, to = np.nonzero(moves * paths.inside)
+        place = (paths.before[pair] * modes + mode, paths.after[pair] * modes + to)
+        shape = (task.num_cells * modes,) * 2
+        kernel = sparse.csr_array((moves[pair, mode, to], place), shape=shape)
+        return World.of(task, without(kernel, least), modes=modes, max_steps=None)
+
+
+def fit_modes(
+    tracks: Tracks, num_cells: int, modes: int, seed: int, before: Fit | None = None
+) -> Fit:
+    """The most likely motion with hidden modes.
 
     Args:
-        task: sensors, prices, limits and memory.
         tracks: the paths; random ones, where there are many points.
+        num_cells: M.
         modes: K.
-        least: moves less likely than that are left out.
         seed: of the tracks and of the first guesses.
+        before: of most of the tracks, where there is one: in place of guesses.
     """
     rng = np.random.default_rng(seed)
-    few, paths = (_Paths.of(tracks, task.num_cells, most, rng) for most in (_FIRST, _MOST))
+    few, paths = (_Paths.of(tracks, num_cells, most, rng) for most in (_FIRST, _MOST))
+    if before is not None:
+        return Fit(paths, _after(paths, before.paths.on(paths, before.moves), _AGAIN, 0)[0])
     guesses = sorted(
         (_guessed(few, modes, rng) for _ in range(_GUESSES)), key=lambda guess: -guess[1]
     )
     fits = [_after(paths, few.on(paths, moves), _ROUNDS, _FREE) for moves, _ in guesses[:_REFINED]]
-    moves = max(fits, key=lambda fit: fit[1])[0]
-    # Half an exit in one more move, as of pooled moves: on recordings that all stop no episode would end.
-    moves *= 1.0 - 0.5 / (paths.count + 1)
-    pair, mode, to = np.nonzero(moves * paths.inside)
-    place = (paths.before[pair] * modes + mode, paths.after[pair] * modes + to)
-    shape = (task.num_cells * modes,) * 2
-    kernel = sparse.csr_array((moves[pair, mode, to], place), shape=shape)
-    return World.of(task, without(kernel, least), modes=modes, max_steps=None)
+    return Fit(paths, max(fits, key=lambda fit: fit[1])[0])
 
 
 def _guessed(paths: _Paths, modes: int, rng: np.random.Generator) -> tuple[Array, float]:

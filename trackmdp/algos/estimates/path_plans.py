@@ -35,8 +35,9 @@ _LEAST = 100
 """Detections of a key, equal paths taken as one, from which its plan is searched: those of rarer keys follow chance."""
 _ROUNDS, _LEAST_SHARE, _RISE = 30, 1 / 64, 1e-5
 """Rounds of exchange at most, the smallest share of the keys that are changed at once, and the least rise of reward."""
-_SEARCHED = 2
-"""The best plans, which exchange begins from."""
+_SEARCHED, _NEAR = 2, 0.01
+"""The best plans, which policy iteration begins from; exchange then from the best result, and from another that earns
+less by no more than this share, which it may make up for."""
 TRIED, _MOST, _MOST_JUDGED = 200_000, 1_000_000, 600_000
 """Events on which plans are tried, on which the best are searched, and of validation paths: a round takes a second for
 a million. On 600,000, which is 40,000 points where the safe action may miss, plans ended up to .01 a step lower."""
@@ -83,17 +84,18 @@ def choose_plan(
     judged = Paths(task, thinned(task, judge, _MOST_JUDGED, seed), discount)
     tried = [_improved(few, prior, rounds).plans for prior in priors]
     tried += [_made(make, counted, few) for make in others]
-    order = _ranked(judged, tried)[:_SEARCHED]
+    earned = _earned(judged, tried)
+    order = np.argsort(-earned, kind="stable")[:_SEARCHED].tolist()
     better = [_improved(paths, weights[place], rounds, tried[place]) for place in order]
-    searched = [_searched(paths, each) for each in better]
-    first = _first(judged, searched)
-    made = [each.plans for each in (*better, searched[first])]
-    plans = [*(tried[place] for place in order), *made]
-    best = _ranked(judged, plans)[0]
+    after = _earned(judged, [each.plans for each in better])
+    near = _near(after)
+    first, found = _first(judged, [_searched(paths, better[number]) for number in near])
+    plans = [tried[place] for place in order] + [each.plans for each in (*better, found)]
+    best = int(np.argmax([*earned[order], *after, *_earned(judged, plans[-1:])]))
     if counted is tracks or enough is not counted:  # of more paths there were enough already
         return _valued(paths, plans[best].on(paths.keys))
     stage, number = divmod(best, len(order))
-    place = order[number if stage < 2 else first]
+    place = order[number if stage < 2 else near[first]]
     whole = Paths(task, thinned(task, tracks, _MOST, seed), discount)
     if stage == 0 and place >= len(priors):  # as it was made
         again = _made(others[place - len(priors)], tracks, whole, plans[best].table())
@@ -121,15 +123,20 @@ def _improved(paths: Paths, prior: float, rounds: int, start: KeyPlans | None = 
     return plan_paths(paths, prior=prior * paths.copies, rounds=rounds, start=start)
 
 
-def _ranked(judged: Paths, plans: Sequence[KeyPlans]) -> list[int]:
-    """The places of plans, the one that earns most on the judging paths first."""
-    earned = np.array([along(judged, each).reward for each in plans])
-    return np.argsort(-earned, kind="stable").tolist()
+def _earned(judged: Paths, plans: Sequence[KeyPlans]) -> Array:
+    """The reward of each of the plans on the judging paths."""
+    return np.array([along(judged, each).reward for each in plans])
 
 
-def _first(judged: Paths, searched: Sequence[Planned]) -> int:
-    """The place of the best result of exchange, by all paths: on those it was made on, each was chosen alike."""
-    return int(np.argmax([each.reward + along(judged, each.plans).reward for each in searched]))
+def _near(earned: Array) -> list[int]:
+    """The places of the plans that earn the most, or little less."""
+    return np.flatnonzero(earned >= earned.max() - _NEAR * abs(earned.max())).tolist()
+
+
+def _first(judged: Paths, searched: Sequence[Planned]) -> tuple[int, Planned]:
+    """The best result of exchange, by all paths, and its place: on those it was made on, each was chosen alike."""
+    first = int(np.argmax([each.reward + along(judged, each.plans).reward for each in searched]))
+    return first, searched[first]
 
 
 def _valued(paths: Paths, plans: KeyPlans) -> Planned:
