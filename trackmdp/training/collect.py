@@ -104,9 +104,13 @@ def _in_workers(
         try:
             return kind(of_workers(_worker_env, env, cfg, done), policy, **threads, **common)
         except (RuntimeError, EOFError, OSError) as error:
-            # TorchRL's message has the worker's whole traceback from its second line on.
-            reason = message_of(error)
-            raise RunError(f"collector={cfg.name}: a worker did not start ({reason})") from error
+            raise not_started(cfg, error) from error
+
+
+def not_started(cfg: WorkersConfig, error: Exception) -> RunError:
+    """What a worker that ended before it could collect is told as."""
+    # TorchRL's message has the worker's whole traceback from its second line on.
+    return RunError(f"collector={cfg.name}: a worker did not start ({message_of(error)})")
 
 
 multi_sync = partial(_in_workers, MultiSyncCollector)

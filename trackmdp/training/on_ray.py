@@ -16,8 +16,8 @@ from torchrl.collectors.distributed import RayCollector
 from trackmdp.cluster import joining, ray_options
 from trackmdp.config.learning import RayWorkersConfig
 from trackmdp.environment.env import TrackEnv
-from trackmdp.errors import RunError, message_of, require
-from trackmdp.training.collect import MakeEnv, of_workers, own_env
+from trackmdp.errors import message_of, require
+from trackmdp.training.collect import MakeEnv, not_started, of_workers, own_env
 
 _STORE = 2**30
 """Bytes for the batches on their way, of a cluster that is started here."""
@@ -57,7 +57,7 @@ def ray(
         made.update_policy_weights_()
     except RuntimeError as error:  # TorchRL waits a minute for each of them
         made.shutdown()  # else they would keep their cores of a cluster that goes on
-        raise RunError(f"collector=ray: a worker did not start ({message_of(error)})") from error
+        raise not_started(cfg, error) from error
     return made
 
 

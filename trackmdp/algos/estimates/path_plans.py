@@ -89,9 +89,9 @@ def choose_plan(
     better = [_improved(paths, weights[place], rounds, tried[place]) for place in order]
     after = _earned(judged, [each.plans for each in better])
     near = _near(after)
-    first, found = _first(judged, [_searched(paths, better[number]) for number in near])
+    first, found, most = _first(judged, [_searched(paths, better[number]) for number in near])
     plans = [tried[place] for place in order] + [each.plans for each in (*better, found)]
-    best = int(np.argmax([*earned[order], *after, *_earned(judged, plans[-1:])]))
+    best = int(np.argmax([*earned[order], *after, most]))
     if counted is tracks or enough is not counted:  # of more paths there were enough already
         return _valued(paths, plans[best].on(paths.keys))
     stage, number = divmod(best, len(order))
@@ -133,10 +133,14 @@ def _near(earned: Array) -> list[int]:
     return np.flatnonzero(earned >= earned.max() - _NEAR * abs(earned.max())).tolist()
 
 
-def _first(judged: Paths, searched: Sequence[Planned]) -> tuple[int, Planned]:
-    """The best result of exchange, by all paths, and its place: on those it was made on, each was chosen alike."""
-    first = int(np.argmax([each.reward + along(judged, each.plans).reward for each in searched]))
-    return first, searched[first]
+def _first(judged: Paths, searched: Sequence[Planned]) -> tuple[int, Planned, float]:
+    """The best result of exchange, its place and what it earns on the judging paths.
+
+    The best one by all paths: on those it was made on, each was chosen alike.
+    """
+    earned = _earned(judged, [each.plans for each in searched])
+    first = int(np.argmax(earned + [each.reward for each in searched]))
+    return first, searched[first], float(earned[first])
 
 
 def _valued(paths: Paths, plans: KeyPlans) -> Planned:
