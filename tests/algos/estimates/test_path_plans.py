@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -167,6 +168,28 @@ def test_exchange_begins_from_plans_that_may_end_as_the_best(
     earned: list[float], searched: list[int]
 ) -> None:
     assert path_plans._near(np.array(earned)) == searched
+
+
+@pytest.mark.parametrize("most", [9.0, 0.0])
+def test_the_best_result_is_planned_again_with_the_weight_it_began_from(
+    most: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two weights the second one earns more, the first one after policy iteration; or exchange from that earns 9."""
+    weights, improved = list[float](), path_plans._improved
+
+    def noted(paths: Paths, prior: float, *rest: Any) -> Any:
+        weights.append(prior)
+        return improved(paths, prior, *rest)
+
+    monkeypatch.setattr(path_plans, "_improved", noted)
+    monkeypatch.setattr(path_plans, "_NEAR", 10.0)
+    monkeypatch.setattr(path_plans, "_first", lambda _, found: (1, found[1], most))
+    earned = iter([np.array([1.0, 2.0]), np.array([3.0, 4.0])])
+    monkeypatch.setattr(path_plans, "_earned", lambda *_: next(earned))
+    tracks = line_walks(5, count=40)
+    task = recorded(tracks, memory="displacement", clip=1)
+    choose_plan(task, tracks, priors=(1.0, 100.0), discount=1.0, rounds=1)
+    assert weights == [1.0, 100.0, 100.0, 1.0, 1.0]
 
 
 def test_another_plan_that_is_chosen_is_made_of_all_paths_and_left_as_it_is() -> None:
