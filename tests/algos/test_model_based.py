@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,11 +16,13 @@ from tests.helpers import algorithm, collect, headings, hop_world, small_world, 
 from tests.tracks import by_hand, recorded, write
 from tests.typed import refused
 from trackmdp.algos.estimates import path_plans
+from trackmdp.algos.estimates.hidden_modes import Fit, fit_modes
 from trackmdp.algos.estimates.shrinkage import believed_world
 from trackmdp.algos.model_based import ModelBased
 from trackmdp.algos.observed import observed_paths
 from trackmdp.app.cli import main
 from trackmdp.policies.policy import Policy
+from trackmdp.policies.table import PolicyTable
 from trackmdp.recordings.tracks import Recorded
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import evaluate
@@ -194,6 +197,28 @@ def test_it_learns_the_zigzag_from_recordings(
     assert replay(task, task.tracks, learner.actor).totals[:, 0] == pytest.approx(moves * 0.8)
     assert figures["keys_seen"] > 7
     assert figures["reward_per_move"] == pytest.approx(0.8, abs=0.01)
+
+
+def test_hidden_modes_of_more_paths_are_fitted_from_those_of_fewer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    task = swept(memory="displacement", clip=1)
+    plan, begun = PolicyTable.all_on(task), list[Fit | None]()
+    fits = [fit_modes(task.tracks, 9, 2, seed) for seed in range(2)]
+
+    def fitted(*given: Any) -> Fit:
+        begun.append(given[-1])
+        return fits[len(begun) - 1]
+
+    monkeypatch.setattr("trackmdp.algos.model_based.fit_modes", fitted)
+    monkeypatch.setattr("trackmdp.solvers.hidden.best_found", lambda *_, **__: plan)
+    monkeypatch.setattr("trackmdp.solvers.exchange.improve", lambda *_: plan)
+    learner = on_tracks(task, iterations=1)
+    for before in (None, plan):
+        assert learner._with_modes(task.tracks, before) is plan
+    first, second = begun
+    assert first is None
+    assert second is fits[0]
 
 
 def test_plans_on_paths_are_made_three_times_and_at_the_end() -> None:
