@@ -11,9 +11,11 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from operator import attrgetter
+from typing import TypeAlias
 
 import numpy as np
 
+from trackmdp.arrays.types import AnyArray
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers import optimal
@@ -33,11 +35,15 @@ counts where sensors share cells; entries of the steps of all annealed policies,
 ones."""
 _ROUNDS = 20
 """Of exchange, for policies from which the best one is made: the first gain most, and where sensors share cells two."""
-_MOST_LED, _MOST_ANNEALED, _MOST_CROSSED, _MOST_AT_ONCE, _ALIKE = 4, 6, 800, 200, 1e-6
-"""Other homotopies, annealed and crossed policies at most; crossed ones of one search, which more do not improve; and
-the relative difference up to which two count as one. On three by three cells crossing gains up to .003 a step."""
+_MOST_LED, _MOST_ANNEALED, _MOST_CROSSED, _MOST_AT_ONCE = 4, 6, 800, 200
+"""Other homotopies, annealed and crossed policies at most, and crossed ones of one search, which more do not improve.
+On three by three cells crossing gains up to .003 a step."""
+_OLD, _ALIKE = 40, 1e-6
+"""A search ends after so many policies in a row that were found before, up to this relative difference."""
 
 _worth = attrgetter("aihtr")
+_Ends: TypeAlias = dict[bytes, list[AnyArray]]
+"""Sets after exchange, by those before."""
 
 
 def solve(world: World, *, start: PolicyTable | None = None) -> Solution:
@@ -68,28 +74,40 @@ def best_found(
         annealed: policies to anneal at least; in place of homotopies, where a search takes long.
         effort: share of the policies that are crossed.
     """
-    renewal = Renewal(world, world.motion)
-    pool = [_searched(renewal, each) for each in _starts(renewal, world, start, annealed)]
+    renewal, ends = Renewal(world, world.motion), _Ends()
+    pool = [_searched(renewal, each, ends) for each in _starts(renewal, world, start, annealed)]
     if len(pool) > 1:
         count = int(effort * min(_CROSSED_WORK // _work(renewal), _MOST_CROSSED))
         times = -(-count // _MOST_AT_ONCE)
         rng = np.random.default_rng(derive(0, "hidden", "crossed"))
-        pool += [one for _ in range(times) for one in _crossed(renewal, pool, count // times, rng)]
+        searches = [_crossed(renewal, pool, count // times, rng, ends) for _ in range(times)]
+        pool += [one for each in searches for one in each]
     return renewal.table(exchanged(renewal, max(pool, key=_worth)).sets)
 
 
-def _searched(renewal: Renewal, policy: Found) -> Found:
-    return exchanged(renewal, policy, rounds=_ROUNDS // _slower(renewal), exact=False)
+def _searched(renewal: Renewal, policy: Found, ends: _Ends) -> Found:
+    """After exchange; its sets are kept, as many searches begin from the same ones."""
+    mark = _bytes(policy.sets)
+    if mark in ends:
+        return Found(renewal, ends[mark], policy)
+    found = exchanged(renewal, policy, rounds=_ROUNDS // _slower(renewal), exact=False)
+    ends[mark] = ends[_bytes(found.sets)] = found.sets
+    return found
+
+
+def _bytes(sets: list[AnyArray]) -> bytes:
+    return b"".join(each.tobytes() for each in sets)
 
 
 def _crossed(
-    renewal: Renewal, pool: list[Found], count: int, rng: np.random.Generator
+    renewal: Renewal, pool: list[Found], count: int, rng: np.random.Generator, ends: _Ends
 ) -> list[Found]:
     """A genetic search: `count` times exchange from the plans of one policy and of another, each key's by chance.
 
     In the first half a child takes the place of the parent that it is more like (crowding, Mahfoud 1995), so that the
-    policies stay different; then that of the policy of the least worth.
+    policies stay different; then that of the policy of the least worth. Ends early where nothing is new.
     """
+    worths, old = [each.aihtr for each in pool], 0
     for number in range(count):
         pool = sorted(pool, key=_worth, reverse=True)
         # The better one of two, and any other.
@@ -97,13 +115,21 @@ def _crossed(
         another += another >= one
         taken = rng.random(len(renewal.plans)) < 0.5
         sets = mixed(renewal.layout, taken, pool[another].sets, pool[one].sets)
-        child = _searched(renewal, Found(renewal, sets, pool[one]))
-        # Policies of one worth are mostly the same.
-        if not np.isclose(child.aihtr, [each.aihtr for each in pool], rtol=_ALIKE, atol=0.0).any():
+        child = _searched(renewal, Found(renewal, sets, pool[one]), ends)
+        if _new(child, [each.aihtr for each in pool]):
             like = min((one, another), key=lambda place: _differences(child, pool[place]))
             place = like if number < count // 2 else -1
             pool[place] = max(child, pool[place], key=_worth)
+        old = 0 if _new(child, worths) else old + 1
+        if old == _OLD:
+            break
+        worths.append(child.aihtr)
     return pool
+
+
+def _new(policy: Found, worths: list[float]) -> bool:
+    """Policies of one worth are mostly the same."""
+    return not np.isclose(policy.aihtr, worths, rtol=_ALIKE, atol=0.0).any()
 
 
 def _differences(one: Found, other: Found) -> int:
