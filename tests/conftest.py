@@ -15,6 +15,8 @@ import pytest
 import torch
 from hypothesis import settings
 
+from trackmdp.solvers import hidden
+
 torch.set_num_threads(1)
 settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=30)
 settings.load_profile("repeatable")
@@ -23,6 +25,13 @@ settings.load_profile("repeatable")
 def pytest_collection_finish() -> None:
     """What is imported by now stays: without this each collection of garbage looks through all of it again."""
     gc.freeze()
+
+
+@pytest.fixture
+def little_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where modes are hidden, one start and no crossing: for tests of what is made of a policy, however good it is."""
+    for limit in ("_MOST_CROSSED", "_MOST_ANNEALED", "_MOST_LED"):
+        monkeypatch.setattr(hidden, limit, 0)
 
 
 @pytest.fixture

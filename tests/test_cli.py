@@ -314,6 +314,8 @@ sys.exit(main(["train"]))
         stderr=subprocess.PIPE,
         text=True,
         env=ENVIRONMENT,
+        # The tests may run in the background, where a shell has Ctrl-C ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     assert process.stdout is not None
     assert process.stdout.readline().startswith("train ")

@@ -102,6 +102,7 @@ def test_it_comes_near_the_optimum_with_every_kind_of_sensing(more: dict[str, ob
     assert regret_per_step(best.aihtr, found) < 0.02
 
 
+@pytest.mark.usefixtures("little_search")
 @pytest.mark.parametrize("detection", [1.0, 0.8])
 def test_a_hidden_mode_is_learned_by_paths(detection: float) -> None:
     """Better than any plan of pooled moves, also where some cells of the paths are unknown."""
@@ -133,6 +134,7 @@ def test_its_uncertainty_shrinks_and_covers_the_truth() -> None:
     assert visits[0] > 0
 
 
+@pytest.mark.usefixtures("little_search")
 @pytest.mark.parametrize("sensing", ["all", "chosen"])
 @pytest.mark.parametrize("hidden", [False, True])
 def test_a_resumed_learner_goes_on_as_the_first(sensing: str, hidden: bool, tmp_path: Path) -> None:
@@ -262,6 +264,7 @@ def test_a_run_is_valued_loaded_exported_and_resumed(here: Path) -> None:
     assert table(torch.tensor([16]), torch.tensor([0])).nonzero().tolist() == [[0, 2]]
 
 
+@pytest.mark.usefixtures("little_search")
 def test_a_hidden_heading_is_solved_and_learned(here: Path) -> None:
     """By the command line: the learned policy is no better than the solved one, and valued exactly."""
     world = ["kernel=heading", "grid.size=3", "kernel.exit_probability=0.1", "task.clip=1"]

@@ -103,19 +103,23 @@ def test_it_is_used_by_the_commands_from_python_and_by_the_tests_over_all_choice
     assert (tmp_path / "solved" / "solution.json").is_file()
 
 
-NEW = "sensor=fading task.memory=misses kernel=heading kernel.exit_probability=0.1 grid.size=3"
+NEW = "sensor=fading task.memory=misses kernel.exit_probability=0.1 grid.size=3 kernel="
 
 
-def test_a_new_sensor_and_a_new_memory_work_in_every_command(site: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kernel", ["random_walk", pytest.param("heading", marks=pytest.mark.slow)])
+def test_a_new_sensor_and_a_new_memory_work_in_every_command(
+    kernel: str, site: Path, tmp_path: Path
+) -> None:
     """Sensors that see less far away and the gap between detections: solved, learned, simulated, logged, replayed."""
     few = "collector.total_frames=10000 evaluation.every=1 algo=a2c optimal.enabled=false"
+    new = NEW + kernel
     lines = (
-        f"solve {NEW} hydra.run.dir=solved",
-        f"train {NEW} {few} hydra.run.dir=run",
+        f"solve {new} hydra.run.dir=solved",
+        f"train {new} {few} hydra.run.dir=run",
         "evaluate run=run episodes=100 log=[mcap] hydra.run.dir=found",
         "replay file=found/episodes.mcap verify=true",
-        f"evaluate {NEW} baseline=optimal episodes=0 hydra.run.dir=best",
-        f"train {NEW.replace('misses', 'mises')} hydra.run.dir=other",
+        f"evaluate {new} baseline=optimal episodes=0 hydra.run.dir=best",
+        f"train {new.replace('misses', 'mises')} hydra.run.dir=other",
     )
     said = called(site, tmp_path, *lines)
     assert [status for status, _, _ in said] == [0, 0, 0, 0, 0, 2], said

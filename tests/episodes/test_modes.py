@@ -125,6 +125,7 @@ def logged(folder: Path, *words: str) -> EpisodeReader:
     return EpisodeReader(folder / "episodes.mcap")
 
 
+@pytest.mark.usefixtures("little_search")
 @pytest.mark.parametrize(
     "words",
     [
@@ -159,6 +160,7 @@ def test_a_log_resimulates_bit_for_bit(words: list[str], tmp_path: Path) -> None
     assert main(["replay", file, "episode=2", "quiet=true"]) == 0
 
 
+@pytest.mark.usefixtures("little_search")
 def test_a_cut_log_is_recovered_with_its_modes(tmp_path: Path) -> None:
     logged(tmp_path, "baseline=optimal").close()
     whole = (tmp_path / "episodes.mcap").read_bytes()
@@ -183,6 +185,7 @@ def test_a_mode_that_differs_is_named() -> None:
     )
 
 
+@pytest.mark.usefixtures("little_search")
 def test_a_run_is_evaluated_and_its_episodes_logged(tmp_path: Path) -> None:
     """What training logged, and what `evaluate run=` says: the run's own figures, and episodes that replay."""
     words = [

@@ -103,6 +103,7 @@ def test_sensors_out_of_the_window_have_no_chance() -> None:
     assert 0 < (chance == 0).sum() < len(chance)  # two moves may lead out of it
 
 
+@pytest.mark.slow
 def test_annealed_policies_end_above_the_homotopy() -> None:
     """Where the safe action misses, its states depend on all plans; each seed ends above, and not where others do."""
     made = make_world("heading", size=3, cost=0.296, t_max=1, memory="displacement_gap")

@@ -14,7 +14,6 @@ import trackmdp as tm
 from tests.solvers.worlds import all_plans
 from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError
-from trackmdp.solvers import hidden
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.frontier import FrontierProgress, frontier
 from trackmdp.solvers.tradeoff import Tradeoff
@@ -200,8 +199,8 @@ def test_what_no_mixture_has_is_refused(asked: dict[str, float], named: str) -> 
         found(None).at(**asked)
 
 
-def test_where_the_bracket_stays_open_the_bound_is_above(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hidden, "_MOST_CROSSED", 0)  # takes most of the time
+@pytest.mark.usefixtures("little_search")
+def test_where_the_bracket_stays_open_the_bound_is_above() -> None:
     world = tm.make_world("heading", size=3)
     made = frontier(world, resolution=0.02)
     assert not made.certified

@@ -31,8 +31,8 @@ def test_a_revealed_heading_leaves_little_to_lose(keep: float, cost: float, loss
     assert best.certified
 
 
-def test_a_revealed_mode_is_worth_more_than_any_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hidden, "_MOST_CROSSED", 0)  # takes most of the time
+@pytest.mark.usefixtures("little_search")
+def test_a_revealed_mode_is_worth_more_than_any_memory() -> None:
     known, remembered = solve(headings(revealed=8)), solve(headings(memory="displacement_gap"))
     assert remembered.lower < known.lower <= known.upper <= remembered.upper + 1e-9
     # A policy of the displacement alone is worth the same where the mode is revealed.
@@ -40,9 +40,8 @@ def test_a_revealed_mode_is_worth_more_than_any_memory(monkeypatch: pytest.Monke
     assert again.aihtr == pytest.approx(remembered.lower)
 
 
-def test_the_bound_holds_for_every_memory_and_memory_pays(monkeypatch: pytest.MonkeyPatch) -> None:
-    for limit in ("_MOST_CROSSED", "_MOST_ANNEALED", "_MOST_LED"):  # take most of the time
-        monkeypatch.setattr(hidden, limit, 0)
+@pytest.mark.usefixtures("little_search")
+def test_the_bound_holds_for_every_memory_and_memory_pays() -> None:
     cell, more = (
         solve(headings(5, 0.9, cost=0.16, memory=memory)) for memory in ("cell", "displacement")
     )
@@ -63,6 +62,7 @@ def test_exchange_goes_on_where_one_set_at_a_time_stops() -> None:
     assert exchange.exchanged(renewal, start).aihtr > one.aihtr > start.aihtr
 
 
+@pytest.mark.slow
 def test_annealed_and_crossed_policies_end_higher(monkeypatch: pytest.MonkeyPatch) -> None:
     """On 3 x 3 cells a run of `model_based` ended at 37.2789, homotopies below it."""
     world, values = make_world("heading", size=3), []

@@ -79,6 +79,7 @@ def test_both_questions_are_answered(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "2.56 (D/r) for each safe action" in printed
 
 
+@pytest.mark.usefixtures("little_search")
 def test_an_open_bracket_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["kernel=heading", "grid.size=3", "resolution=0.5", f"hydra.run.dir={tmp_path / 'a'}"]
     assert main(["frontier", *words]) == 0
@@ -178,6 +179,7 @@ def test_the_figure_shows_the_corners_and_what_was_asked_for(tmp_path: Path) -> 
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
+@pytest.mark.usefixtures("little_search")
 def test_the_figure_shows_net_accuracy_and_an_open_bound(tmp_path: Path) -> None:
     words = ["kernel=heading", "grid.size=3", "resolution=0.5", "quiet=true"]
     assert main(["frontier", *words, f"hydra.run.dir={tmp_path / 'a'}"]) == 0

@@ -26,6 +26,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.usefixtures("little_search")
 def test_verify_says_what_has_no_case(here: Path) -> None:
     assert main(["verify", *WORLD, "kernel.reveals=true", f"hydra.run.dir={here}/v"]) == 0
     content = json.loads((here / "v/verification.json").read_text())
@@ -118,6 +119,7 @@ def test_large_systems_are_iterated_to_the_same_value(monkeypatch: pytest.Monkey
     assert iterated.accuracy == pytest.approx(exact.accuracy, rel=1e-11)
 
 
+@pytest.mark.usefixtures("little_search")
 @pytest.mark.parametrize(
     "kernel",
     ["regimes", "constant_velocity", pytest.param("coordinated_turn", marks=pytest.mark.slow)],
