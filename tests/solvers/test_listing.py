@@ -20,6 +20,7 @@ from trackmdp.world.model import World
 WORLDS = {
     "footprints": footprint_world(1),
     "other footprints": footprint_world(9),
+    "footprints that miss": footprint_world(1).but(detection=0.7),
     "own sensors": World.of(footprint_world(9), footprint_world(9).kernel, coverage=None, cost=0.2),
     "modes": headings(2, t_max=1, revealed=8, safe_cost=0.5),
 }

@@ -26,7 +26,7 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.entries import per_row, row_index, summing, with_data
+from trackmdp.arrays.entries import per_row, ranks, row_index, summing, with_data
 from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.sensing.choose import TIE, Decisions
@@ -34,6 +34,8 @@ from trackmdp.sensing.task import Task
 
 _PROVED = 1e-9
 """Part of the possible gain up to which a set counts as the best: rounding of linear and integer programs."""
+_LISTED, _MOST_SETS, _AT_ONCE = 14, 2**22, 2**18
+"""Sensors of a row that may miss, up to which all sets are gone through; sets of all rows, and how many at once."""
 _SCALE = 1e5
 """The largest gain in an integer program."""
 _MOST = 2**26
@@ -254,11 +256,25 @@ class Shared(Decisions):
         """The linear program of each row, of gains `[E]` and prices `[G]`; sets alone where `exact`.
 
         All rows make one program, which falls apart into theirs; `exact` solves those with fractions, few if any, as
-        integer programs. With sensors that miss their sets are good ones, and only the bound is proved.
+        integer programs. Of up to fourteen sensors that may miss all sets are gone through; where there are more the
+        sets are good ones, and only the bound is proved.
         """
         # A sensor is in no solution if all its entries together gain no more than its price.
         use = self.distinct(price)
         use = use[self.sees[use] @ np.maximum(gain, 0.0) > price[use]]
+        if not exact:
+            return self._relaxed(use, gain, price)
+        few = self._few(use)
+        sets, upper = self._of_all(use[few[self.rows[use]]], gain, price)
+        if not few.all():
+            relaxed = self._relaxed(use[~few[self.rows[use]]], gain, price)
+            other, above = self._rounded(relaxed.on, gain, price, relaxed.upper)
+            sets, upper = np.where(few[self.rows], sets, other), np.where(few, upper, above)
+        seen = self.report(sets[:, None])[:, 0]
+        return Cover(sets.astype(np.float64), seen.astype(np.float64), upper)
+
+    def _relaxed(self, use: IndexArray, gain: Array, price: Array) -> Cover:
+        """The linear programs, of the decisions `use`."""
         reached = np.bincount(self.sees[use].indices, minlength=len(gain)) > 0
         entries = np.flatnonzero(reached & (gain > 0))
         sees, cost, value = self.sees[use][:, entries], price[use], gain[entries]
@@ -273,13 +289,53 @@ class Shared(Decisions):
             owner[pairs.col] = self.rows[use][pairs.row]
             upper = per_row(owner, most * (value - worth), self.count)
             upper += per_row(self.rows[use], np.maximum(sees @ worth - cost, 0.0), self.count)
-        if exact:
-            sets, upper = self._rounded(on, gain, price, upper)
-            seen = self.report(sets[:, None])[:, 0]
-            return Cover(sets.astype(np.float64), seen.astype(np.float64), upper)
         whole = np.ones(len(gain))
         whole[entries] = most
         return Cover(on, np.minimum(on @ self.sees, whole) * (gain > 0), upper)
+
+    def _few(self, use: IndexArray) -> BoolArray:
+        """`[K]`, whether all sets of the decisions `use` of a row are gone through."""
+        width = np.bincount(self.rows[use], minlength=self.count)
+        if self.perfect:
+            return width == 0
+        order = np.argsort(width, kind="stable")
+        few = width <= _LISTED
+        few[order] &= np.cumsum(2.0 ** width[order]) <= _MOST_SETS
+        return few
+
+    def _of_all(self, use: IndexArray, gain: Array, price: Array) -> tuple[BoolArray, Array]:
+        """The best of all sets `[G]` of the decisions `use`, and its gain `[K]`."""
+        on, most = np.zeros(len(self.rows), dtype=bool), np.zeros(self.count)
+        width = np.bincount(self.rows[use], minlength=self.count)
+        for count in np.unique(width[width > 0]).tolist():
+            rows = np.flatnonzero(width == count)
+            for some in np.array_split(rows, 1 + (len(rows) << count) // _AT_ONCE):
+                these = use[np.isin(self.rows[use], some)].reshape(-1, count)
+                on[these], most[some] = self._best_of_all(these, gain, price)
+        return on, most
+
+    def _best_of_all(self, these: IndexArray, gain: Array, price: Array) -> tuple[BoolArray, Array]:
+        """The same of rows with equally many decisions, `these` `[K, S]`."""
+        width = these.shape[1]
+        logs = self._logs[:, these.ravel()].tocoo()
+        row, sensor = np.divmod(logs.col, width)
+        # The entries of a row are numbered from 0; all rows get as many, those that they lack without gain.
+        entries, entry = np.unique(logs.row, return_inverse=True)
+        owner = np.zeros(len(entries), dtype=np.int64)
+        owner[entry] = row
+        order = np.argsort(owner, kind="stable")
+        place = np.empty(len(order), dtype=np.int64)
+        place[order] = ranks(owner[order])
+        shape = (len(these), int(place.max(initial=0)) + 1)
+        dense, gains = np.zeros((len(these), width, shape[1])), np.zeros(shape)
+        dense[row, sensor, place[entry]] = logs.data
+        gains[owner, place] = gain[entries]
+        # Set number 5 of three sensors has the first and the third: 5 = 1 + 4.
+        sets = (np.arange(2**width)[:, None] >> np.arange(width)) & 1
+        unreported = np.exp(sets.astype(np.float64) @ dense)
+        worth = ((1.0 - unreported) @ gains[:, :, None])[:, :, 0] - price[these] @ sets.T
+        best = worth.argmax(axis=1)
+        return sets[best] > 0, worth[np.arange(len(these)), best]
 
     def _rounded(
         self, on: Array, gain: Array, price: Array, upper: Array

@@ -2,8 +2,8 @@
 
 Given the sets before it, the last set of a plan is a best answer (`choose`). So a row's best plan is found by going
 through the sets before: the subsets of the sensors in reach, one bit for each, or with a budget the small ones. Where
-sensors share cells only the cells covered by the first set matter: of all sets that cover the same ones the cheapest
-counts, and there are 2^Z such subsets of the Z successors.
+sensors that never miss share cells only the cells covered by the first set matter: of all sets that cover the same
+ones the cheapest counts, and there are 2^Z such subsets of the Z successors.
 
 Most choices need not be followed: with the state revealed after the listed sets they would be worth less than the plan
 at hand.
@@ -28,7 +28,7 @@ from trackmdp.solvers.plans import Plans
 _MOST_BITS = 14
 """Sensors of a row in all sets but the last up to which all choices are listed; with a budget 2^14 choices."""
 _MOST_PATTERNS = 2**22
-"""Sets of cells covered, of all rows: 32 MB of prices."""
+"""Choices of all rows; as sets of cells covered, 32 MB of prices."""
 
 
 @dataclass(frozen=True)
@@ -106,10 +106,10 @@ def _choices(plans: Plans) -> _Choices | None:
     choices = [turn.choice for turn in turns]
     if not turns:
         return _Choices(1, lambda _: _Tried([], []), lambda _: [])
-    if all(isinstance(choice, Own) for choice in choices):
-        return _of_sensors(plans)
     first = choices[0]
-    return _of_patterns(plans, first) if isinstance(first, Shared) and len(turns) == 1 else None
+    if not (isinstance(first, Shared) and first.perfect):
+        return _of_sensors(plans)
+    return _of_patterns(plans, first) if len(turns) == 1 else None
 
 
 def _of_sensors(plans: Plans) -> _Choices | None:
@@ -117,10 +117,9 @@ def _of_sensors(plans: Plans) -> _Choices | None:
     owners = [turn.choice.rows for turn in plans.turns[:-1]]
     numbers = list(map(ranks, owners))
     choice = plans.turns[0].choice
-    assert isinstance(choice, Own)
-    few = choice.budget is not None
-    found = _small_sets(numbers, choice.budget or 0) if few else _all_sets(owners, numbers)
-    if found is None:
+    budget = choice.budget if isinstance(choice, Own) else None
+    found = _all_sets(owners, numbers) if budget is None else _small_sets(numbers, budget)
+    if found is None or plans.layout.count * found[0] > _MOST_PATTERNS:
         return None
     count, bits = found
 
@@ -128,7 +127,7 @@ def _of_sensors(plans: Plans) -> _Choices | None:
         found = []
         for t, turn in enumerate(plans.turns[:-1]):
             on = bits(t, numbers[turn.choice.rows]) & 1 > 0
-            allowed = turn.choice.allowed
+            allowed = turn.choice.allowed if isinstance(turn.choice, Own) else None
             found.append(on if allowed is None else on & allowed[:, 0])
         return found
 
@@ -186,7 +185,7 @@ def _of_patterns(plans: Plans, choice: Shared) -> _Choices | None:
     turn = plans.turns[0]
     number = ranks(turn.rows)
     bits = int(number.max(initial=0)) + 1
-    if not choice.perfect or plans.layout.count << bits > _MOST_PATTERNS:
+    if plans.layout.count << bits > _MOST_PATTERNS:
         return None
     kept = choice.distinct(turn.price)
     cheapest = _cheapest(choice.some(kept), turn.price[kept], number, 2**bits)
