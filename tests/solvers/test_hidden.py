@@ -13,6 +13,7 @@ from trackmdp.solvers import bounds, exchange, hidden, optimal, search
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found
+from trackmdp.solvers.solution import SearchProgress
 from trackmdp.solvers.solve import solve
 from trackmdp.world.make import make_world
 from trackmdp.world.model import World
@@ -84,7 +85,7 @@ def test_what_is_found_is_no_worse_than_the_start(monkeypatch: pytest.MonkeyPatc
         monkeypatch.setattr(hidden, limit, 0)
     least, kept, again = (
         evaluate(world, policy).aihtr
-        for policy in (hidden.best_found(world), best, hidden.best_found(world, start=best))
+        for policy in (hidden.best_found(world), best, hidden.solve(world, start=best).table)
     )
     assert least < kept <= again + 1e-9
 
@@ -92,18 +93,18 @@ def test_what_is_found_is_no_worse_than_the_start(monkeypatch: pytest.MonkeyPatc
 def test_a_child_has_the_plans_of_two(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before exchange, about half of the keys' plans are those of each; the worst policy leaves the pool."""
     world = headings(3, 0.7, cost=0.12, memory="displacement")
-    renewal, begun = Renewal(world, world.motion), list[Found]()
-    rng = np.random.default_rng(0)
+    search, begun = hidden.Search(world), list[Found]()
+    renewal, rng = search.renewal, np.random.default_rng(0)
     every, none = ([np.full(len(c.rows), on) for c in renewal.choices] for on in (True, False))
     better = exchange.exchanged(renewal, Found(renewal, none))
     monkeypatch.setattr(hidden, "exchanged", lambda *a, **_: begun.append(a[1]) or better)
-    pool = hidden._crossed(renewal, [Found(renewal, every), Found(renewal, none)], 1, rng, {})
+    pool = search.crossed([Found(renewal, every), Found(renewal, none)], 1, rng)
     rows, on = renewal.choices[0].rows, begun[0].sets[0]
     share = [on[rows == row].mean() for row in np.unique(rows)]
     assert set(share) == {0.0, 1.0}
     assert 0.3 < np.mean(share) < 0.7
     assert [each.aihtr for each in pool][-1] == better.aihtr
-    again = hidden._crossed(renewal, pool, 3, rng, {})  # it is known
+    again = hidden.Search(world).crossed(pool, 3, rng)  # it is known
     assert sum(each is better for each in again) == 1
 
 
@@ -112,7 +113,7 @@ def test_a_child_takes_the_place_of_the_parent_that_it_is_like(
 ) -> None:
     """In the first half; then that of the policy of the least worth."""
     world = headings(3, 0.7, cost=0.12, memory="displacement")
-    renewal = Renewal(world, world.motion)
+    renewal = hidden.Search(world).renewal
     low, middle, child = (
         Found(renewal, [np.arange(len(choice.rows)) % 4 < on for choice in renewal.choices])
         for on in (0, 1, 3)
@@ -120,7 +121,7 @@ def test_a_child_takes_the_place_of_the_parent_that_it_is_like(
     assert low.aihtr < middle.aihtr < child.aihtr
     monkeypatch.setattr(hidden, "exchanged", lambda *a, **_: child)
     for count, stays in ((2, low), (1, middle)):
-        pool = hidden._crossed(renewal, [low, middle], count, np.random.default_rng(0), {})
+        pool = hidden.Search(world).crossed([low, middle], count, np.random.default_rng(0))
         assert {id(each) for each in pool} == {id(stays), id(child)}
 
 
@@ -130,7 +131,8 @@ def test_no_sets_are_searched_twice_and_a_search_that_finds_nothing_new_ends(
 ) -> None:
     """Of nine keys' plans from two policies there are 512 mixtures; of 300 draws some 230 differ."""
     world, begun = headings(3, 0.7, cost=0.12), list[bytes]()
-    renewal = Renewal(world, world.motion)
+    search = hidden.Search(world)
+    renewal = search.renewal
     every, none = (
         Found(renewal, [np.full(len(c.rows), on) for c in renewal.choices]) for on in (True, False)
     )
@@ -138,16 +140,36 @@ def test_no_sets_are_searched_twice_and_a_search_that_finds_nothing_new_ends(
     monkeypatch.setattr(
         hidden, "exchanged", lambda *a, **_: begun.append(hidden._bytes(a[1].sets)) or none
     )
-    hidden._crossed(renewal, [every, none], 800, np.random.default_rng(0), {})
+    search.crossed([every, none], 800, np.random.default_rng(0))
     assert least < len(begun) == len(set(begun)) <= most
 
 
 def test_less_effort_crosses_fewer_policies(monkeypatch: pytest.MonkeyPatch) -> None:
     world, crossed = make_world("heading", size=3), list[int]()
-    monkeypatch.setattr(hidden, "_crossed", lambda *a: crossed.append(a[2]) or a[1])
+    monkeypatch.setattr(hidden.Search, "crossed", lambda *a: crossed.append(a[2]) or a[1])
     for effort in (1.0, 0.5, 0.0):
         hidden.best_found(world, effort=effort)
     assert crossed == [199, 199, 199, 199, 199, 199]
+
+
+def test_a_search_can_be_watched_limited_and_interrupted() -> None:
+    """After each policy: the best one so far beside the bound, and what is left; the first one is always there."""
+    world, seen = headings(3, 0.7, memory="displacement"), list[SearchProgress]()
+
+    def watch(progress: SearchProgress) -> None:
+        seen.append(progress)
+        if len(seen) == 40:
+            raise KeyboardInterrupt
+
+    stopped = hidden.solve(world, on_progress=watch)
+    assert stopped.interrupted
+    assert stopped.lower == pytest.approx(max(each.lower for each in seen))
+    assert [each.lower for each in seen] == sorted(each.lower for each in seen)
+    assert {each.upper for each in seen} == {stopped.upper}
+    assert all(each.left is not None and each.left >= 0 for each in seen)
+    late = solve(world, time_limit=1e-9)
+    assert (late.timed_out, late.interrupted, late.certified) == (True, False, False)
+    assert late.lower <= stopped.lower < late.upper
 
 
 def test_where_a_search_takes_long_some_are_annealed_in_place_of_homotopies(

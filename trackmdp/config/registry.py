@@ -52,7 +52,12 @@ def maker(node: ChoiceConfig | type[ChoiceConfig]) -> Callable[..., Any]:
 
 def make(node: ChoiceConfig, *args: Any, **more: Any) -> Any:
     """Call the code of a choice with `args`, the options of the choice by name, and `more`."""
-    return maker(node)(*args, **{name: getattr(node, name) for name in options(type(node))}, **more)
+    return maker(node)(*args, **options_of(node), **more)
+
+
+def options_of(node: ChoiceConfig) -> dict[str, Any]:
+    """The options of a choice, by name."""
+    return {name: getattr(node, name) for name in options(type(node))}
 
 
 @lru_cache(maxsize=1)

@@ -9,7 +9,7 @@ keys are the states.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from operator import attrgetter
 from typing import TypeAlias
 
@@ -20,10 +20,11 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers import optimal
 from trackmdp.solvers.annealing import anneal
+from trackmdp.solvers.certify.budget import Budget
 from trackmdp.solvers.exchange import exchanged, other_starts
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found, clocked_sets, follow_credit, mixed
-from trackmdp.solvers.solution import Solution
+from trackmdp.solvers.solution import SearchProgress, Solution
 from trackmdp.solvers.value import averaged_kernel, value_of
 from trackmdp.world.model import World
 
@@ -42,89 +43,210 @@ _OLD, _ALIKE = 40, 1e-6
 """A search ends after so many policies in a row that were found before, up to this relative difference."""
 
 _worth = attrgetter("aihtr")
-_Ends: TypeAlias = dict[bytes, list[AnyArray]]
-"""Sets after exchange, by those before."""
+Watch: TypeAlias = Callable[[Found | None, float], bool]
+"""Takes the best policy so far and the share of the work that is done; whether to go on."""
 
 
-def solve(world: World, *, start: PolicyTable | None = None) -> Solution:
-    """The best policy found for keys of the world's memory.
+def solve(
+    world: World,
+    *,
+    nodes: int = 5_000_000,
+    time_limit: float | None = None,
+    tolerance: float = 1e-6,
+    memory: str | None = None,
+    start: PolicyTable | None = None,
+    on_progress: Callable[[SearchProgress], None] | None = None,
+) -> Solution:
+    """The best policy found for keys of the world's memory; Ctrl-C ends the search with what it has found.
 
     Args:
         world: with hidden modes.
+        nodes: of the bound's proof.
+        time_limit: seconds after which the search ends with the best policy so far, and as many for the bound's proof.
+        tolerance: bracket that counts as closed, relative to the value.
+        memory: of the bound's proof, as in `optimal.solve`.
         start: a deterministic policy of the same keys that the one found is no worse than.
+        on_progress: called after each policy that is searched.
     """
     began = time.monotonic()
-    table = best_found(world, start=start)
-    evaluation = value_of(world, table)
-    bound = np.maximum(optimal.solve(revealing(world)).bound, evaluation.value)
+    best = optimal.solve(
+        revealing(world),
+        nodes=nodes,
+        time_limit=time_limit,
+        tolerance=tolerance,
+        memory=memory,
+    )
+    budget, interrupted = Budget(nodes, time_limit), best.interrupted
+    search = Search(world, _watching(on_progress, budget, best, began))
+    try:
+        if not interrupted:
+            search.run(start=start)
+    except KeyboardInterrupt:
+        interrupted = True
+    evaluation = value_of(world, search.table)
+    bound = np.maximum(best.bound, evaluation.value)
     gap = float((bound - evaluation.value).mean())
-    certified = gap <= 1e-6 * max(1.0, abs(evaluation.aihtr))
-    seconds = time.monotonic() - began
-    return Solution(table, evaluation, bound, certified, seconds, nodes=0, interrupted=False)
+    certified = gap <= tolerance * max(1.0, abs(evaluation.aihtr))
+    seconds, late = time.monotonic() - began, budget.timed_out and not certified
+    return Solution(
+        search.table, evaluation, bound, certified, seconds, best.nodes, interrupted, late
+    )
 
 
-def best_found(
-    world: World, *, start: PolicyTable | None = None, annealed: int = 0, effort: float = 1.0
-) -> PolicyTable:
-    """The policy of `solve`, without its bound.
+def _watching(
+    on_progress: Callable[[SearchProgress], None] | None,
+    budget: Budget,
+    best: Solution,
+    began: float,
+) -> Watch:
+    """Tells of the search below the bound of `best`, until the time is up."""
+
+    def watch(found: Found | None, share: float) -> bool:
+        if found is not None and on_progress is not None:
+            seconds = time.monotonic() - began
+            ends = found.aihtr, best.upper, seconds, best.nodes
+            on_progress(SearchProgress(*ends, "search, at most", seconds / share - seconds))
+        return budget.left()
+
+    return watch
+
+
+def best_found(world: World, *, annealed: int = 0, effort: float = 1.0) -> PolicyTable:
+    """The policy of `solve`, without its bound; see `Search.run`."""
+    search = Search(world)
+    search.run(annealed=annealed, effort=effort)
+    return search.table
+
+
+class Search:
+    """A search for the best policy.
 
     Args:
         world: with hidden modes.
-        start: as of `solve`.
-        annealed: policies to anneal at least; in place of homotopies, where a search takes long.
-        effort: share of the policies that are crossed.
+        watch: takes the best policy so far and the share of the work that is done; whether to go on.
+
+    Attributes:
+        best: the best policy so far.
     """
-    renewal, ends = Renewal(world, world.motion), _Ends()
-    pool = [_searched(renewal, each, ends) for each in _starts(renewal, world, start, annealed)]
-    if len(pool) > 1:
-        count = int(effort * min(_CROSSED_WORK // _work(renewal), _MOST_CROSSED))
-        times = -(-count // _MOST_AT_ONCE)
-        rng = np.random.default_rng(derive(0, "hidden", "crossed"))
-        searches = [_crossed(renewal, pool, count // times, rng, ends) for _ in range(times)]
-        pool += [one for each in searches for one in each]
-    return renewal.table(exchanged(renewal, max(pool, key=_worth)).sets)
 
+    def __init__(self, world: World, watch: Watch = lambda *_: True) -> None:
+        self.world, self.renewal = world, Renewal(world, world.motion)
+        self.best: Found | None = None
+        self._watch, self._done, self._most = watch, 0, 1
+        # Sets after exchange, by those before: many searches begin from the same ones.
+        self._ends: dict[bytes, list[AnyArray]] = {}
 
-def _searched(renewal: Renewal, policy: Found, ends: _Ends) -> Found:
-    """After exchange; its sets are kept, as many searches begin from the same ones."""
-    mark = _bytes(policy.sets)
-    if mark in ends:
-        return Found(renewal, ends[mark], policy)
-    found = exchanged(renewal, policy, rounds=_ROUNDS // _slower(renewal), exact=False)
-    ends[mark] = ends[_bytes(found.sets)] = found.sets
-    return found
+    @property
+    def table(self) -> PolicyTable:
+        """The best policy so far; where there is none, the one that homotopies begin from."""
+        if self.best is None:
+            return self.renewal.table(clocked_sets(self.renewal, self.world))
+        return self.renewal.table(self.best.sets)
+
+    def run(
+        self, *, start: PolicyTable | None = None, annealed: int = 0, effort: float = 1.0
+    ) -> None:
+        """Look for policies from several starts, and cross them.
+
+        Args:
+            start: as of `solve`.
+            annealed: policies to anneal at least; in place of homotopies, where a search takes long.
+            effort: share of the policies that are crossed.
+        """
+        count = int(effort * min(_CROSSED_WORK // self._work, _MOST_CROSSED))
+        led, hot = self._planned(annealed)
+        self._most, pool = led + hot + count + (start is not None), list[Found]()
+        for policy in self._starts(start, led, hot):
+            pool.append(self.searched(policy))
+            if not self._goes_on():
+                break
+        if len(pool) > 1:
+            times = -(-count // _MOST_AT_ONCE)
+            rng = np.random.default_rng(derive(0, "hidden", "crossed"))
+            for _ in range(times):
+                self.crossed(pool, count // times, rng)
+        if self.best is not None and self._goes_on():
+            self.best = exchanged(self.renewal, self.best)
+
+    def _goes_on(self) -> bool:
+        return self._watch(self.best, self._done / self._most) or self.best is None
+
+    def searched(self, policy: Found) -> Found:
+        """After exchange."""
+        mark = _bytes(policy.sets)
+        if mark in self._ends:
+            found = Found(self.renewal, self._ends[mark], policy)
+        else:
+            rounds = _ROUNDS // self._slower
+            found = exchanged(self.renewal, policy, go_on=self._goes_on, rounds=rounds, exact=False)
+            self._ends[mark] = self._ends[_bytes(found.sets)] = found.sets
+        self._done += 1
+        if self.best is None or found.aihtr > self.best.aihtr:
+            self.best = found
+        return found
+
+    def crossed(self, pool: list[Found], count: int, rng: np.random.Generator) -> list[Found]:
+        """A genetic search: `count` times exchange from the plans of two policies, each key's of one of them by chance.
+
+        In the first half a child takes the place of the parent that it is more like (crowding, Mahfoud 1995), so that
+        the policies stay different; then that of the policy of the least worth. Ends early where nothing is new.
+        """
+        worths, old = [each.aihtr for each in pool], 0
+        for number in range(count):
+            if not self._goes_on():
+                break
+            pool = sorted(pool, key=_worth, reverse=True)
+            # The better one of two, and any other.
+            one, another = (
+                int(rng.integers(len(pool), size=2).min()),
+                int(rng.integers(len(pool) - 1)),
+            )
+            another += another >= one
+            taken = rng.random(len(self.renewal.plans)) < 0.5
+            sets = mixed(self.renewal.layout, taken, pool[another].sets, pool[one].sets)
+            child = self.searched(Found(self.renewal, sets, pool[one]))
+            if _new(child, [each.aihtr for each in pool]):
+                like = min((one, another), key=lambda place: _differences(child, pool[place]))
+                place = like if number < count // 2 else -1
+                pool[place] = max(child, pool[place], key=_worth)
+            old = 0 if _new(child, worths) else old + 1
+            worths.append(child.aihtr)
+            if old == _OLD:
+                break
+        return pool
+
+    def _planned(self, least: int) -> tuple[int, int]:
+        """How many homotopies, and annealed policies; of these at least so many."""
+        more = max(_MORE_EVENTS // (self._slower * self.renewal.count) - 1, 0)
+        many = _MOST_WORK // self._work
+        led = 1 + min(more, _MOST_LED) if many or not least else 0
+        return led, min(max(more, many, least), _MOST_ANNEALED)
+
+    def _starts(self, start: PolicyTable | None, led: int, annealed: int) -> Iterator[Found]:
+        """Policies to search from: a known one, those of homotopies, and annealed ones."""
+        renewal, world = self.renewal, self.world
+        if start is not None:
+            yield Found(renewal, renewal.sets(start))
+        if led:
+            first = Found(renewal, clocked_sets(renewal, world))
+            yield follow_credit(renewal, world, first, _STEPS, _SWEEPS)
+            for sets in other_starts(renewal, world, led - 1, _STEPS, _SWEEPS):
+                yield Found(renewal, sets)
+        rng = np.random.default_rng(derive(0, "hidden", "annealed"))
+        for place in range(annealed):
+            yield anneal(renewal, world, rng, led=place % 2 == 1)
+
+    @property
+    def _work(self) -> int:
+        return self._slower * max(sum(len(step.rows) for step in self.renewal.steps), 1)
+
+    @property
+    def _slower(self) -> int:
+        return 1 if self.world.coverage is None else _SHARED
 
 
 def _bytes(sets: list[AnyArray]) -> bytes:
     return b"".join(each.tobytes() for each in sets)
-
-
-def _crossed(
-    renewal: Renewal, pool: list[Found], count: int, rng: np.random.Generator, ends: _Ends
-) -> list[Found]:
-    """A genetic search: `count` times exchange from the plans of one policy and of another, each key's by chance.
-
-    In the first half a child takes the place of the parent that it is more like (crowding, Mahfoud 1995), so that the
-    policies stay different; then that of the policy of the least worth. Ends early where nothing is new.
-    """
-    worths, old = [each.aihtr for each in pool], 0
-    for number in range(count):
-        pool = sorted(pool, key=_worth, reverse=True)
-        # The better one of two, and any other.
-        one, another = int(rng.integers(len(pool), size=2).min()), int(rng.integers(len(pool) - 1))
-        another += another >= one
-        taken = rng.random(len(renewal.plans)) < 0.5
-        sets = mixed(renewal.layout, taken, pool[another].sets, pool[one].sets)
-        child = _searched(renewal, Found(renewal, sets, pool[one]), ends)
-        if _new(child, [each.aihtr for each in pool]):
-            like = min((one, another), key=lambda place: _differences(child, pool[place]))
-            place = like if number < count // 2 else -1
-            pool[place] = max(child, pool[place], key=_worth)
-        old = 0 if _new(child, worths) else old + 1
-        if old == _OLD:
-            break
-        worths.append(child.aihtr)
-    return pool
 
 
 def _new(policy: Found, worths: list[float]) -> bool:
@@ -134,32 +256,6 @@ def _new(policy: Found, worths: list[float]) -> bool:
 
 def _differences(one: Found, other: Found) -> int:
     return sum(int((a != b).sum()) for a, b in zip(one.sets, other.sets, strict=True))
-
-
-def _starts(
-    renewal: Renewal, world: World, start: PolicyTable | None, least: int
-) -> Iterator[Found]:
-    """Policies to search from: a known one, those of homotopies, and annealed ones."""
-    if start is not None:
-        yield Found(renewal, renewal.sets(start))
-    more = max(_MORE_EVENTS // (_slower(renewal) * renewal.count) - 1, 0)
-    many = _MOST_WORK // _work(renewal)
-    if many or not least:
-        first = Found(renewal, clocked_sets(renewal, world))
-        yield follow_credit(renewal, world, first, _STEPS, _SWEEPS)
-        for sets in other_starts(renewal, world, min(more, _MOST_LED), _STEPS, _SWEEPS):
-            yield Found(renewal, sets)
-    rng = np.random.default_rng(derive(0, "hidden", "annealed"))
-    for place in range(min(max(more, many, least), _MOST_ANNEALED)):
-        yield anneal(renewal, world, rng, led=place % 2 == 1)
-
-
-def _work(renewal: Renewal) -> int:
-    return _slower(renewal) * max(sum(len(step.rows) for step in renewal.steps), 1)
-
-
-def _slower(renewal: Renewal) -> int:
-    return 1 if renewal.task.coverage is None else _SHARED
 
 
 def revealing(world: World) -> World:

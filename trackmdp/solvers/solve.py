@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, overload
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.by_blocks import SweptPartitionConfig
 from trackmdp.config.compose import compose, default, given
-from trackmdp.config.registry import make, maker
+from trackmdp.config.registry import make, maker, options_of
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.linear import DIRECT_CELLS
@@ -110,7 +110,7 @@ def run_solver(
     From `start`, a known policy, those solvers begin that take one; the policy is then no worse.
     """
     if not world.tells_all or (world.modes > 1 and choice.name != "optimal"):
-        return _modes(world, choice, start)
+        return _modes(world, choice, start, on_progress)
     if world.memory != "cell":  # the state is known at a detection: more of the past is of no use
         world = world.but(memory="cell")
     if world.coverage is not None and partition is not None and partition.block is not None:
@@ -157,12 +157,17 @@ def solve_group(
     return GroupSolution(group, singles, upper, time.monotonic() - started)
 
 
-def _modes(world: World, choice: BaselineConfig, start: PolicyTable | None) -> Solution:
+def _modes(
+    world: World,
+    choice: BaselineConfig,
+    start: PolicyTable | None,
+    on_progress: Callable[[SearchProgress], None] | None,
+) -> Solution:
     """As `run_solver`, where modes are hidden, or the solver does not read them."""
     from trackmdp.solvers import hidden
 
     if choice.name == "optimal":
-        return hidden.solve(world, start=start)
+        return hidden.solve(world, start=start, on_progress=on_progress, **options_of(choice))
     started = time.monotonic()
     made = make(choice, hidden.averaged(world))
     table = made.table if isinstance(made, Solution) else made
