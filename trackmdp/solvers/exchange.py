@@ -15,9 +15,8 @@ one row.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 from scipy import sparse
@@ -32,6 +31,8 @@ from trackmdp.solvers.plans import Layout, Plans, Turn
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import (
     Found,
+    GoOn,
+    always,
     ascended,
     candidates_of,
     clocked_sets,
@@ -60,13 +61,6 @@ _ROUNDS = 40
 """Of exchange, at most."""
 _SEEN = 1e-12
 """Keys with fewer visits an episode keep their plans: nothing is gained by them."""
-
-GoOn: TypeAlias = Callable[[], bool]
-"""Asked before each part whether to look further."""
-
-
-def _always() -> bool:
-    return True
 
 
 def _flips() -> BoolArray:
@@ -117,7 +111,7 @@ def best_of(
     policy: Found,
     others: Iterable[list[BoolArray]],
     *,
-    go_on: GoOn = _always,
+    go_on: GoOn = always,
 ) -> Found:
     """For each key the best plan that exchange makes of `policy`, which has been through it, or of any of the `others`.
 
@@ -144,7 +138,7 @@ def exchanged(
     renewal: Renewal,
     policy: Found,
     *,
-    go_on: GoOn = _always,
+    go_on: GoOn = always,
     rounds: int = _ROUNDS,
     exact: bool = True,
 ) -> Found:
@@ -176,10 +170,12 @@ def exchanged(
             # Where nothing was gained nothing is tried again, until the others have settled as well: V has then moved.
             moved = rows_changed(plans.layout, policy.sets, sets)
             policy, tried = better, moved
-        elif tried.all() or not go_on():
+        elif tried.all():
             break
         else:
             tried = everywhere
+        if not go_on():
+            break
     return ascended(renewal, policy) if exact and renewal.task.coverage is not None else policy
 
 
@@ -208,7 +204,7 @@ def revealed(world: World, detected: Array, missed: Array, length: int) -> Array
 
 
 def exchange(
-    plans: Plans, sets: Sequence[BoolArray], rows: BoolArray, go_on: GoOn = _always
+    plans: Plans, sets: Sequence[BoolArray], rows: BoolArray, go_on: GoOn = always
 ) -> list[BoolArray]:
     """Plans worth no less than `sets` to any row; those end where ascent by itself ends.
 

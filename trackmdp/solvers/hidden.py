@@ -43,7 +43,7 @@ _OLD, _ALIKE = 40, 1e-6
 """A search ends after so many policies in a row that were found before, up to this relative difference."""
 
 _worth = attrgetter("aihtr")
-Watch: TypeAlias = Callable[[Found | None, float], bool]
+Watch: TypeAlias = Callable[[Found, float], bool]
 """Takes the best policy so far and the share of the work that is done; whether to go on."""
 
 
@@ -101,11 +101,12 @@ def _watching(
 ) -> Watch:
     """Tells of the search below the bound of `best`, until the time is up."""
 
-    def watch(found: Found | None, share: float) -> bool:
-        if found is not None and on_progress is not None:
+    def watch(found: Found, share: float) -> bool:
+        if on_progress is not None:
             seconds = time.monotonic() - began
+            left = seconds / share - seconds if share else None
             ends = found.aihtr, best.upper, seconds, best.nodes
-            on_progress(SearchProgress(*ends, "search, at most", seconds / share - seconds))
+            on_progress(SearchProgress(*ends, "search, at most", left))
         return budget.left()
 
     return watch
@@ -126,21 +127,19 @@ class Search:
         watch: takes the best policy so far and the share of the work that is done; whether to go on.
 
     Attributes:
-        best: the best policy so far.
+        best: the best policy so far; at first the one that homotopies begin from.
     """
 
     def __init__(self, world: World, watch: Watch = lambda *_: True) -> None:
         self.world, self.renewal = world, Renewal(world, world.motion)
-        self.best: Found | None = None
+        self.best = self._first = Found(self.renewal, clocked_sets(self.renewal, world))
         self._watch, self._done, self._most = watch, 0, 1
         # Sets after exchange, by those before: many searches begin from the same ones.
         self._ends: dict[bytes, list[AnyArray]] = {}
 
     @property
     def table(self) -> PolicyTable:
-        """The best policy so far; where there is none, the one that homotopies begin from."""
-        if self.best is None:
-            return self.renewal.table(clocked_sets(self.renewal, self.world))
+        """The best policy so far."""
         return self.renewal.table(self.best.sets)
 
     def run(
@@ -165,11 +164,11 @@ class Search:
             rng = np.random.default_rng(derive(0, "hidden", "crossed"))
             for _ in range(times):
                 self.crossed(pool, count // times, rng)
-        if self.best is not None and self._goes_on():
+        if self._goes_on():
             self.best = exchanged(self.renewal, self.best)
 
     def _goes_on(self) -> bool:
-        return self._watch(self.best, self._done / self._most) or self.best is None
+        return self._watch(self.best, self._done / self._most)
 
     def searched(self, policy: Found) -> Found:
         """After exchange."""
@@ -181,8 +180,7 @@ class Search:
             found = exchanged(self.renewal, policy, go_on=self._goes_on, rounds=rounds, exact=False)
             self._ends[mark] = self._ends[_bytes(found.sets)] = found.sets
         self._done += 1
-        if self.best is None or found.aihtr > self.best.aihtr:
-            self.best = found
+        self.best = max(self.best, found, key=_worth)
         return found
 
     def crossed(self, pool: list[Found], count: int, rng: np.random.Generator) -> list[Found]:
@@ -228,8 +226,8 @@ class Search:
         if start is not None:
             yield Found(renewal, renewal.sets(start))
         if led:
-            first = Found(renewal, clocked_sets(renewal, world))
-            yield follow_credit(renewal, world, first, _STEPS, _SWEEPS)
+            first, go_on = self._first, self._goes_on
+            yield follow_credit(renewal, world, first, _STEPS, _SWEEPS, go_on=go_on)
             for sets in other_starts(renewal, world, led - 1, _STEPS, _SWEEPS):
                 yield Found(renewal, sets)
         rng = np.random.default_rng(derive(0, "hidden", "annealed"))

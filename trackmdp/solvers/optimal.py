@@ -194,7 +194,8 @@ class _Run:
             self.search_regions(self.side)
             return
         # First the policy, then the proof: branch and bound is the faster the better its start.
-        self.use(self.renewal.table(follow_credit(self.renewal, self.world, self.here).sets))
+        led = follow_credit(self.renewal, self.world, self.here, go_on=self.budget.left)
+        self.use(self.renewal.table(led.sets))
         self.use(self.exchanged(self.here))
         # Last: the search's own result does not depend on `start`.
         if self.start is not None:

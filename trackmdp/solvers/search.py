@@ -12,8 +12,9 @@ lower it for some events, so that a step is kept only if the AIHTR, which is exa
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 
@@ -31,6 +32,15 @@ _TOGETHER = 1_500
 """Events up to which the changes that raise the AIHTR are found together, by a factorisation."""
 _ALONE = 16
 """Else rows to try one by one where no larger part of the changes raises it."""
+
+
+GoOn: TypeAlias = Callable[[], bool]
+"""Asked before each part whether to look further."""
+
+
+def always() -> bool:
+    """A search without a limit."""
+    return True
 
 
 class Found:
@@ -216,7 +226,13 @@ def candidates_of(sets: Sequence[AnyArray]) -> list[AnyArray]:
 
 
 def follow_credit(
-    renewal: Renewal, world: World, first: Found, steps: int = 30, sweeps: int = 3
+    renewal: Renewal,
+    world: World,
+    first: Found,
+    steps: int = 30,
+    sweeps: int = 3,
+    *,
+    go_on: GoOn = always,
 ) -> Found:
     """The homotopy from the clocked bound's credit to the exact one, from the policy `first`, then plain ascent.
 
@@ -227,6 +243,8 @@ def follow_credit(
     value = table[renewal.states, 0]
     policy = best = first
     for step in range(steps + 1):
+        if not go_on():
+            return best
         plans = renewal.problem(value, shares(renewal, policy), credit)
         sets = plans.ascend(candidates_of(policy.sets), sweeps=sweeps, optimism=1.0 - step / steps)
         # Each step of the homotopy moves few sets, so that the value before is a good guess.
@@ -234,13 +252,13 @@ def follow_credit(
         value = policy.value
         if renewal.single or policy.aihtr > best.aihtr:
             best = policy
-    return ascended(renewal, best)
+    return ascended(renewal, best, go_on=go_on)
 
 
-def ascended(renewal: Renewal, policy: Found, *, sweeps: int = 10) -> Found:
+def ascended(renewal: Renewal, policy: Found, *, sweeps: int = 10, go_on: GoOn = always) -> Found:
     """Policy iteration by ascent, until the AIHTR no longer grows."""
     exact = False
-    while True:
+    while go_on():
         plans = renewal.problem(policy.value, shares(renewal, policy))
         sets = columns_of(plans.ascend(candidates_of(policy.sets), sweeps=sweeps, exact=exact))
         better = risen(renewal, policy, plans, sets)
@@ -250,3 +268,4 @@ def ascended(renewal: Renewal, policy: Found, *, sweeps: int = 10) -> Found:
             return policy
         else:
             exact = True  # with shared sensors, once good sets gain no more, the best ones may
+    return policy
