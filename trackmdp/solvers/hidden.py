@@ -83,14 +83,13 @@ def solve(
             search.run(start=start)
     except KeyboardInterrupt:
         interrupted = True
-    evaluation = value_of(world, search.table)
+    table = search.table
+    evaluation = value_of(world, table)
     bound = np.maximum(best.bound, evaluation.value)
     gap = float((bound - evaluation.value).mean())
     certified = gap <= tolerance * max(1.0, abs(evaluation.aihtr))
     seconds, late = time.monotonic() - began, budget.timed_out and not certified
-    return Solution(
-        search.table, evaluation, bound, certified, seconds, best.nodes, interrupted, late
-    )
+    return Solution(table, evaluation, bound, certified, seconds, best.nodes, interrupted, late)
 
 
 def _watching(
