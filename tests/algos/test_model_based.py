@@ -122,6 +122,41 @@ def test_chosen_sets_cost_less() -> None:
     assert not (learner.policy.bits == 255).all()
 
 
+@pytest.mark.parametrize("budget", [0, 2])
+def test_it_keeps_to_a_budget_also_while_learning(budget: int) -> None:
+    """No sensor is on in the first batch: the moves are inferred from where the safe action located the target."""
+    world, most = small_world(3).but(budget=budget), []
+    learner = algorithm("model_based", world, f"cost.budget={budget}")
+    learner.iterations = 20
+    for seed in range(20):
+        batch = collect(world, learner.policy, 512, 20, seed=seed)
+        most.append(int(batch["action"].sum(-1).max()))
+        learner.step(batch)
+    assert most == [0] + [budget] * 19
+    best, found = optimal.solve(world), evaluate(world, learner.actor)
+    assert regret_per_step(best.lower, found) < 0.01
+
+
+def test_plans_on_paths_keep_to_a_budget() -> None:
+    world = headings(memory="displacement").but(budget=1)
+    learner, rows = learn(world, 3, "algo.prior=1", envs=16)
+    assert int(learner.actor.dense().sum(-1).max()) == 1
+    assert rows[-1]["sensors_per_frame"] < 1.0
+
+
+def test_with_a_budget_and_no_algorithm_named(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where modes are hidden the run says which other learner to compare with."""
+    little = ["algo.total_frames=1000", "algo.frames_per_batch=500", "algo.envs=50"]
+    words = ["grid.size=3", "cost.budget=1", *little]
+    for kernel, more, said in (("random_walk", [], False), ("heading", ["algo.prior=1"], True)):
+        run = [f"kernel={kernel}", f"hydra.run.dir={here}/{kernel}", *more]
+        assert main(["train", *words, *run]) == 0
+        shown = " ".join(capsys.readouterr().out.split())
+        assert ("compare with algo=a2c" in shown) is said
+
+
 @pytest.mark.slow
 def test_its_uncertainty_shrinks_and_covers_the_truth() -> None:
     world = small_world(3)
@@ -289,7 +324,9 @@ def test_the_first_line_names_the_estimate(here: Path, capsys: pytest.CaptureFix
     [
         (["algo=path_counts"], "algo=path_counts: renamed, expected algo=model_based"),
         (["algo=learned_kernel"], "algo=learned_kernel: renamed, expected algo=model_based"),
-        (["algo.warm_up=1"], "algo.warm_up=1: without effect with algo.sensing=all"),
+        (["algo.warm_up=1"], "algo.warm_up=1: without effect with algo.sensing=null"),
+        (["algo.sensing=all", "cost.budget=1"], "expected chosen or null with cost.budget=1"),
+        (["algo.warm_up=1", "cost.budget=1"], "algo.warm_up=1: without effect with cost.budget"),
         (["algo.estimate=moves", "algo.prior=2"], "without effect with algo.estimate=moves"),
         (["task.clip=3"], "task.clip=3: without effect with task.memory=cell"),
         (

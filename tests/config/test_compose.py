@@ -69,7 +69,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"algo": "model_based", "algo.warm_up": 1},
-        "algo.warm_up=1: without effect with algo.sensing=all",
+        "algo.warm_up=1: without effect with algo.sensing=null",
     ),
     ({"algo.lr": 0.5}, "algo.lr: renamed, expected algo.learning_rate"),
 ]

@@ -44,7 +44,7 @@ _PRIOR, _EXIT_PRIOR = 0.1, 100.0
 """Moves as many as which the pooled motion, and the pooled exit probability, count in kernels that are drawn or infer
 moves from misses. For plans the counts give the weights (`shrinkage`)."""
 _PLANS_OF_MOVES, _PLANS_OF_PATHS = 6, 3
-_LAST = 6
+_LAST = 50
 """Times the rounds of expectation-maximisation after the last batch."""
 _SAMPLES = 8
 """Kernels drawn for the uncertainty reported."""
@@ -74,7 +74,11 @@ class ModelBased:
         self._located, self._seed = located(task), seed
         by = cfg.estimate or ("moves" if task.markov else None)
         self._paths = None if by == "moves" else SensedPaths(task, seed=derive(seed, "hidden"))
-        self._chooses = cfg.sensing == "chosen"
+        limited = task.budget is not None
+        self._chooses, self._warm_up = (
+            cfg.sensing == "chosen" or limited,
+            0 if limited else cfg.warm_up,
+        )
         self._compares = by is None and task.num_cells <= _MOST_CELLS
         self._estimate = self._new_estimate()
         self._least = least_worth_planning(task)
@@ -85,8 +89,9 @@ class ModelBased:
         self._found = dict.fromkeys(beliefs if by == "moves" else on_paths, math.nan)
         self._before: PolicyTable | None = None
         self._fit: Fit | None = None
-        self.actor = Policy.all_on(task)
-        self.policy = RenewedTable(task, device, on=True) if self._chooses else Policy.all_on(task)
+        # Under a budget the safe action alone locates the target at first, and moves are inferred from where it was.
+        self.actor = Policy.from_table(PolicyTable.none(task)) if limited else Policy.all_on(task)
+        self.policy = RenewedTable(task, device, on=not limited) if self._chooses else self.actor
 
     def _new_estimate(self) -> KernelEstimate:
         share, task = self.cfg.share_cells, self._located
@@ -110,22 +115,31 @@ class ModelBased:
             if self._paths is None or self._chooses:
                 self._estimate.add(observed_paths(known_alone(batch, self.task), self._located))
         last = self._iteration == self.iterations
-        if last or self._iteration % self._every == 0:
-            if self._paths is None or self._chooses:
-                self._estimate.fit(self.cfg.rounds * (_LAST if last else 1))
+        due = last or self._iteration % self._every == 0
+        again = self._chooses and self._iteration % (self.cfg.plan_every or 1) == 0
+        if again or (due and self._paths is None):
+            self._estimate.fit(self.cfg.rounds * (_LAST if last else 1))
+        if due:
             plan = self._plan_moves(last) if self._paths is None else self._plan_paths(last)
             self.actor = as_policy(self.task, plan)
-            # Acting on a draw, not on the mean: where the estimate is unsure the draws differ, and so moves get sensed
-            # that the mean may leave out for good.
-            if isinstance(self.policy, RenewedTable) and self._spent[0] >= self.cfg.warm_up:
-                drawn = self._world(self._estimate.sample(self._rng))
-                self.policy.renew(lifted(self.task, exchange.solve(drawn, 0)))
+        if again and not last and self._spent[0] >= self._warm_up:
+            self._draw()
         return self._diagnostics()
+
+    def _draw(self) -> None:
+        """Act on the plan for a drawn kernel.
+
+        Not on that for the mean: where the estimate is unsure the draws differ, and so moves get sensed that the mean
+        may leave out for good.
+        """
+        assert isinstance(self.policy, RenewedTable)
+        drawn = self._world(self._estimate.sample(self._rng))
+        self.policy.renew(lifted(self.task, exchange.solve(drawn, 0)))
 
     @property
     def _every(self) -> int:
         """Batches from one plan to the next: with all sensors on nothing that is collected depends on it."""
-        if self.cfg.plan_every or self._chooses:
+        if self.cfg.plan_every or (self._chooses and self._paths is None):
             return self.cfg.plan_every or 1
         plans = _PLANS_OF_MOVES if self._paths is None else _PLANS_OF_PATHS
         large = self.task.num_cells > DIRECT_CELLS

@@ -32,7 +32,7 @@ _FACTOR = 0x9E3779B97F4A7C15
 """Odd, so that it has an inverse modulo 2^64."""
 _LONGEST_WAIT = 16
 """Misses of the safe action up to which the cells in between are inferred."""
-EM_ROUNDS = 20
+EM_ROUNDS = 400
 """Rounds of expectation-maximisation, from the moves seen alone: the result does not depend on earlier ones."""
 
 

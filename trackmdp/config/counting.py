@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 from trackmdp.config.learning import EveryTaskConfig
 from trackmdp.config.options import (
@@ -25,8 +25,10 @@ class ModelBasedConfig(EveryTaskConfig):
     Pooled moves where the next move depends on the cell alone, whole paths where it does not.
     """
 
-    sensing: str = option(
-        "all sensors on, or sets chosen by posterior sampling", choices=("all", "chosen")
+    knows_budget: ClassVar[bool] = True
+    sensing: str | None = option(
+        "all sensors on, or sets chosen by posterior sampling; null: all, with cost.budget chosen",
+        choices=("all", "chosen"),
     )
     warm_up: int = option(
         "with chosen sets: env steps with all sensors on before them", unit="frames", ge=0
@@ -45,12 +47,13 @@ class ModelBasedConfig(EveryTaskConfig):
         "of plans on paths: discount inside the credit; policies are evaluated undiscounted"
     )
     rounds: int = count_option(
-        "rounds of expectation-maximisation at each plan, six times as many at the end; of policy iteration on paths",
+        "rounds of expectation-maximisation at each plan at most, fifty times as many at the end; of policy iteration "
+        "on paths",
         le=10**6,
     )
     plan_every: int | None = count_option(
-        "batches from one plan to the next; the last batch has a plan in any case; null: each with chosen sets, else a "
-        "few plans in a run"
+        "batches from one plan to the next; the last batch has a plan in any case; null: each with chosen sets "
+        "and pooled moves, else a few plans in a run"
     )
     share_cells: str | None = file_option(
         "count moves of all cells, or of those of one class, together that are as far from each border; null: of all "
@@ -61,15 +64,21 @@ class ModelBasedConfig(EveryTaskConfig):
     )
 
     def check(self, key: str, root: Any) -> None:
-        """Where a detection reveals the mode, cells do not move alike."""
+        """All sensors keep to no budget; where a detection reveals the mode, cells do not move alike."""
+        if self.sensing == "all" and root.cost.budget is not None:
+            expected = f"chosen or null with cost.budget={root.cost.budget}"
+            raise refuse(f"{key}.sensing", self.sensing, expected)
         if root.kernel.hides and root.kernel.reveals and self.share_cells not in (None, "none"):
             raise refuse(
                 f"{key}.share_cells", self.share_cells, "none or null with kernel.reveals=true"
             )
 
     def ignored(self, root: Any) -> dict[str, str]:
-        """With all sensors on throughout, nothing comes before chosen sets; moves have no prior of keys."""
-        found = {} if self.sensing == "chosen" else {"warm_up": "with algo.sensing=all"}
+        """All sensors are on before chosen sets, if a budget allows it; moves have no prior of keys."""
+        found, limited = {}, root.cost.budget is not None
+        if limited or self.sensing != "chosen":
+            why = "cost.budget" if limited else f"algo.sensing={self.sensing or 'null'}"
+            found["warm_up"] = f"with {why}"
         if self.estimate == "moves":
             found |= dict.fromkeys(("prior", "gamma"), "with algo.estimate=moves")
         return found

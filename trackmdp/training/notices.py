@@ -13,6 +13,7 @@ FAR, _NEAR = 0.05, 0.01
 """Regret per step, in rewards of a detection, from which a policy counts as poor; of credit per sensor where more than
 the cell counts."""
 _SINGLE = "credit per sensor may miss sets that only pay together where more than the cell counts"
+_INFERRED = "with a budget most cells of the paths are inferred, which blurs what hides in them"
 
 
 def why_chosen(config: TrainConfig, subject: Subject) -> str | None:
@@ -54,27 +55,34 @@ def poor(
     found, name = [], max(others, key=lambda each: others[each])
     if others[name] > aihtr + (slack := 1e-6 * max(1.0, abs(aihtr))):
         # A policy of less memory, learned from the same tracks, is named by its option.
-        advice = f"try {name}" if name.startswith("task.memory=") else _help(config)
+        advice = (
+            f"try {name}"
+            if name.startswith("task.memory=")
+            else _help(config, task.budget is not None)
+        )
         found.append(
             f"warning: {name} earns {others[name]:,.3f}, more than the learned policy; {advice}"
         )
     elif regret > (_NEAR if single else FAR) * task.reward:
         why = f" ({_SINGLE})" if single else ""
         said = f"warning: {regret:.3f} per step below the best policy known{why}"
-        found.append(f"{said}; {_help(config)}")
+        found.append(f"{said}; {_help(config, task.budget is not None)}")
     elif single and math.isnan(regret):
         found.append(f"note: {_SINGLE}; compare with algo=model_based")
+    if config.algo.name == "model_based" and task.budget is not None and not task.markov:
+        found.append(f"note: {_INFERRED}; compare with algo=a2c")
     nothing = others.get("no sensors")
     if nothing is not None and nothing >= max(aihtr, *others.values()) - slack:
         found.append("note: no policy known earns more than no sensors at all; see cost.sensor")
     return found
 
 
-def _help(config: TrainConfig) -> str:
+def _help(config: TrainConfig, budget: bool) -> str:
     """The option that helps most."""
     algo = config.algo.name
     if algo in ("a2c", "ppo", "dqn"):
-        return f"try more collector.total_frames, algo={algo}_per_sensor or algo=model_based"
+        others = "" if budget else f"algo={algo}_per_sensor or "
+        return f"try more collector.total_frames, {others}algo=model_based"
     if algo != "model_based":
         return "try algo=model_based"
     if getattr(config.algo, "estimate", None) == "moves":

@@ -23,6 +23,8 @@ from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.grid.displacements import apart, cell_at, displacement
 from trackmdp.grid.size import grid_size
 
+_SETTLED = 1e-4
+"""Share of all moves that a round counts elsewhere than the one before, below which no more rounds follow."""
 _OPEN = 0.01
 """Weight, in the first round's kernel, of moves that were not seen yet."""
 LEAST_EXIT = 1e-9
@@ -124,7 +126,10 @@ class KernelEstimate:
         self._censored = [paths] if len(paths.start) else []
 
     def fit(self, rounds: int) -> None:
-        """Run `rounds` rounds of expectation-maximisation on the censored paths, from the kernel estimated so far.
+        """Run rounds of expectation-maximisation on the censored paths, from the kernel estimated so far.
+
+        At most `rounds` of them: where few moves are censored their number hardly changes after a few; where most are,
+        as with a budget, it takes hundreds.
 
         The first round allows every move a little farther than any that must have been made: expectation-maximisation
         never leaves a probability of zero.
@@ -140,7 +145,9 @@ class KernelEstimate:
                 if first
                 else self.mean()
             )
-            self.counts = self.direct + expected_moves(kernel, paths, copies)
+            before, self.counts = self.counts, self.direct + expected_moves(kernel, paths, copies)
+            if abs(self.counts - before).sum() < _SETTLED * self.counts.sum():
+                break
         counts = self.counts.copy()
         counts.data[counts.data < NEGLIGIBLE] = 0.0
         counts.eliminate_zeros()

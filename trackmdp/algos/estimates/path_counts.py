@@ -242,7 +242,7 @@ class _Counted:
     def _reports(self, n: int, context: IndexArray, mean: Array) -> Array:
         """`[E]`, probability of a report by the sets of a level with mean gains `mean` `[C, W]`."""
         view, task = self._view, self._view.paths.task
-        if task.coverage is None:
+        if task.coverage is None and task.budget is None:
             padded = np.append(mean, np.zeros((len(mean), 1)), axis=1)
             chance = task.detects(view.cell[n])
             gain = padded[context[view.plan[n]], view.local[n]]
