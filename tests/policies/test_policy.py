@@ -461,11 +461,19 @@ def test_random_k_of_the_sensors_that_exist() -> None:
     assert not action[:, 4:].any()
 
 
-def test_a_sensor_outside_the_window_is_refused() -> None:
+@pytest.mark.parametrize("at_once", [1, 3, 4, 100])
+@pytest.mark.parametrize(("cell", "n", "sensor"), [(0, 2, 2), (3, 0, 5), (11, 2, 0)])
+def test_a_sensor_outside_the_window_is_refused(
+    cell: int, n: int, sensor: int, at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Among sensors that can be chosen, wherever it is, and however many are checked at once."""
+    monkeypatch.setattr("trackmdp.policies.table._AT_ONCE", at_once)
     on = np.zeros((12, 3, 12), dtype=bool)
-    on[0, 2, 2] = True
+    on[::2, 1] = np.eye(12, dtype=bool)[::2]
+    Policy.from_dense(windowed(), on)
+    on[cell, n, sensor] = True
     with pytest.raises(
-        UserError, match=r"sensor 2 cannot be chosen from cell 0, with grid\.window=1"
+        UserError, match=rf"sensor {sensor} cannot be chosen from cell {cell}, with grid\.window=1"
     ):
         Policy.from_dense(windowed(), on)
 

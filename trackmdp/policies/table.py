@@ -13,15 +13,15 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.arrays.entries import ones_at, row_index, short_indices
-from trackmdp.arrays.types import AnyArray, Array, BoolArray
+from trackmdp.arrays.entries import ones_at, short_indices
+from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, decimal, grid_words
 from trackmdp.sensing.coverage import reported, shared_out
 from trackmdp.sensing.task import Task, window_cells
 
 _AT_ONCE = 2**19
-"""Entries looked up at once: some 16 MB of intermediate arrays, however large the grid."""
+"""Entries looked up or checked at once: some 16 MB of intermediate arrays, however large the grid."""
 
 
 class SetTable:
@@ -359,14 +359,21 @@ def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
         sets = sets.astype(np.bool_ if np.isin(sets.data, (0, 1)).all() else np.float64)
     sets.sum_duplicates()  # sorts the columns of each row as well
     sets.eliminate_zeros()
-    keys = row_index(sets) // task.num_choices
-    start = task.keys.cell(keys)
-    possible = task.choosable(start, sets.indices)
+    for begin in range(0, sets.nnz, _AT_ONCE):
+        _check_choosable(task, sets, np.arange(begin, min(begin + _AT_ONCE, sets.nnz)))
+    return sets
+
+
+def _check_choosable(task: Task, sets: sparse.csr_array, places: IndexArray) -> None:
+    """Refuse sensors, among those at some `places` of the entries, that cannot be chosen."""
+    # The row of an entry is the last one that begins at or before it: indptr = (0, 2, 2, 5), place 2 is in row 2.
+    row = np.searchsorted(sets.indptr, places, side="right") - 1
+    start, sensors = task.keys.cell(row // task.num_choices), sets.indices[places]
+    possible = task.choosable(start, sensors)
     if possible is not None and not possible.all():
-        x, sensor = int(start[~possible][0]), int(sets.indices[~possible][0])
+        x, sensor = int(start[~possible][0]), int(sensors[~possible][0])
         why = f"with grid.window={task.window}" if task.available[sensor] else "for there is none"
         raise UserError(f"policy: sensor {sensor} cannot be chosen from cell {x}, {why}")
-    return sets
 
 
 def _choosable_sets(task: Task, probability: float) -> sparse.csr_array:
