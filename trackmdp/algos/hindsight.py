@@ -68,8 +68,8 @@ def budget(task: Task, cfg: PerSensorConfig) -> tuple[int, int]:
         few, hidden = True, 64
     if task.num_keys > _MOST_CELLS_OF_NETS:
         hidden = 0
-    # Plans on whole paths, which begin from the nets' policies, end no better after more updates.
-    effort = cfg.effort if task.markov else 1.0
+    # With a memory, plans on whole paths, which begin from the nets' policies, end no better after more updates.
+    effort = 1.0 if task.order else cfg.effort
     updates = cfg.updates or round(effort * (500 if few else 800))
     return updates, hidden if cfg.hidden is None else cfg.hidden
 
