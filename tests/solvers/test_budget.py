@@ -139,7 +139,7 @@ def test_policies_with_more_sensors_are_refused() -> None:
     [
         (["frontier", "cost.budget=2"], "cost.budget=2: expected null here"),
         (["verify", "cost.budget=2"], "cost.budget=2: expected null here"),
-        (["train", "cost.budget=2"], "algo=model_based: expected one of a2c, "),
+        (["train", "cost.budget=2", "algo=hindsight"], "algo=hindsight: expected one of a2c, "),
         (["solve", "cost.budget=2", "solver=lookahead"], "solver=lookahead: expected one of"),
         (["solve", "cost.budget=2", "sensor=footprint"], "expected null with sensor=footprint"),
         (["solve", "cost.budget=2", "partition.block=5"], "cost.budget=2: expected null here"),

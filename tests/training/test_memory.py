@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from tests.helpers import collect, small_world, train_config
+from tests.helpers import algorithm, collect, small_world, train_config
 from trackmdp.algos.dqn import DQN
 from trackmdp.app.cli import main
 from trackmdp.config import DqnConfig
@@ -35,6 +35,22 @@ def system(root: Path, free: int, **cgroup: str) -> Path:
     for name, text in cgroup.items():
         (root / "sys/fs/cgroup" / name.replace("_", ".", 1)).write_text(text)
     return root
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("algo=model_based", "cost.budget=2"),
+        ("algo=model_based", "algo.sensing=chosen", "grid.window=1"),
+        ("algo=hindsight", "algo.collect=mixed"),
+    ],
+)
+def test_a_table_that_is_renewed_takes_what_was_estimated(words: tuple[str, ...]) -> None:
+    cfg = train_config("grid.size=4", *words)
+    task = small_world(size=4).but(budget=cfg.cost.budget, window=cfg.grid.window)  # type: ignore[attr-defined]
+    learner = algorithm(words[0].partition("=")[2], task, *words[1:])
+    assert needs(cfg, task.task)["grid.size"] == learner.policy.bits.nbytes
+    assert not needs(train_config("grid.size=4", words[0]), task.task).get("grid.size")
 
 
 @pytest.mark.parametrize("prioritized", [True, False])

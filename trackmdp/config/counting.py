@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from trackmdp.config.learning import EveryTaskConfig
+from trackmdp.config.learning import EveryTaskConfig, renewed_table
 from trackmdp.config.options import (
     BYTES,
     TABLE,
@@ -84,8 +84,11 @@ class ModelBasedConfig(EveryTaskConfig):
         return found
 
     def needs(self, task: Sizes, root: Any) -> dict[str, int]:
-        """The paths, and the gains of each detection that may be on them."""
+        """The paths, and the gains of each detection that may be on them; the table of chosen sets."""
+        chosen = self.sensing == "chosen" or root.cost.budget is not None
+        found = {"grid.size": renewed_table(task)} if chosen else {}
         if task.markov or self.estimate == "moves":
-            return {}
+            return found
         per_frame = (task.t_max + 3) ** task.order * (task.t_max + 2) * 12
-        return {"algo.total_frames": root.collector.total_frames * per_frame * BYTES["float64"]}
+        paths = root.collector.total_frames * per_frame * BYTES["float64"]
+        return found | {"algo.total_frames": paths}

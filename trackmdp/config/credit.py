@@ -10,6 +10,7 @@ from trackmdp.config.learning import (
     EveryTaskConfig,
     ScheduleConfig,
     networks,
+    renewed_table,
 )
 from trackmdp.config.options import (
     BYTES,
@@ -93,7 +94,7 @@ class PerSensorConfig(EveryTaskConfig):
         return {} if self.collect == "mixed" else {"explore": "with algo.collect=all_on"}
 
     def needs(self, task: Sizes, root: Any) -> dict[str, int]:
-        """The moves kept, and their sorting; the paths of one update; the networks.
+        """The moves kept, and their sorting; the paths of one update; the networks; the table that explores.
 
         A move is two cells of 16 bits. Where moves of different paths do not combine (`markov`), a third number
         marks the ones that go on; paths of t_max + 3 cells, longer ones where a policy remembers detections, are kept
@@ -111,6 +112,7 @@ class PerSensorConfig(EveryTaskConfig):
             # Each cell of a path, and about five numbers that are gathered for it.
             "algo.batch_size": self.batch_size * length * 6 * BYTES["int64"],
             "algo.hidden": networks(task, self.hidden),
+            "grid.size": renewed_table(task) if self.collect == "mixed" else 0,
         }
 
 

@@ -295,6 +295,11 @@ def state_bytes(task: Sizes, targets: int = 1) -> int:
     return targets * each + task.num_choices * task.num_sensors
 
 
+def renewed_table(task: Sizes) -> int:
+    """Bytes of the table by which a policy that is renewed while learning acts: a bit for each key, n and sensor."""
+    return task.num_keys * task.num_choices * -(-task.num_sensors // 8)
+
+
 def networks(task: Sizes, hidden: int | None) -> int:
     """Bytes of two networks of one hidden layer (256 units where `hidden` is left open), with Adam's two moments."""
     # located cell, n and both at once by number; the history by sensor, as are the outputs
