@@ -23,7 +23,7 @@ from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.grid.displacements import apart, cell_at, displacement
 from trackmdp.grid.size import grid_size
 
-_SETTLED = 1e-4
+_SETTLED = 1e-5
 """Share of all moves that a round counts elsewhere than the one before, below which no more rounds follow."""
 _OPEN = 0.01
 """Weight, in the first round's kernel, of moves that were not seen yet."""
