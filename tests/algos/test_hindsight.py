@@ -78,10 +78,8 @@ def test_keys_of_three_detections_take_fewer_updates_and_smaller_nets() -> None:
 
 def test_credit_per_sensor_takes_more_updates_but_with_a_memory() -> None:
     cfg, task = train_config("algo=a2c_per_sensor").algo, Task(10, cost=0.1, t_max=4, markov=False)
-    assert [budget(replace(task, memory=m), cfg)[0] for m in ("cell", "displacement")] == [
-        1280,
-        800,
-    ]
+    found = [budget(replace(task, memory=memory), cfg)[0] for memory in ("cell", "displacement")]
+    assert found == [1280, 800]
 
 
 def test_a_target_that_goes_farther_than_the_nets_see_is_gone() -> None:

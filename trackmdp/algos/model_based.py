@@ -45,7 +45,7 @@ _PRIOR, _EXIT_PRIOR = 0.1, 100.0
 moves from misses. For plans the counts give the weights (`shrinkage`)."""
 _PLANS_OF_MOVES, _PLANS_OF_PATHS = 6, 3
 _LAST = 50
-"""Times the rounds of expectation-maximisation after the last batch."""
+"""Times the rounds of expectation-maximisation, at most, after the last batch."""
 _SAMPLES = 8
 """Kernels drawn for the uncertainty reported."""
 _MOST_CELLS = 1_600
@@ -75,10 +75,7 @@ class ModelBased:
         by = cfg.estimate or ("moves" if task.markov else None)
         self._paths = None if by == "moves" else SensedPaths(task, seed=derive(seed, "hidden"))
         limited = task.budget is not None
-        self._chooses, self._warm_up = (
-            cfg.sensing == "chosen" or limited,
-            0 if limited else cfg.warm_up,
-        )
+        self._chooses, self._warm_up = cfg.chooses(task.budget), 0 if limited else cfg.warm_up
         self._compares = by is None and task.num_cells <= _MOST_CELLS
         self._estimate = self._new_estimate()
         self._least = least_worth_planning(task)
@@ -90,7 +87,7 @@ class ModelBased:
         self._before: PolicyTable | None = None
         self._fit: Fit | None = None
         # Under a budget the safe action alone locates the target at first, and moves are inferred from where it was.
-        self.actor = Policy.from_table(PolicyTable.none(task)) if limited else Policy.all_on(task)
+        self.actor = Policy.none(task) if limited else Policy.all_on(task)
         self.policy = RenewedTable(task, device, on=not limited) if self._chooses else self.actor
 
     def _new_estimate(self) -> KernelEstimate:
@@ -116,13 +113,13 @@ class ModelBased:
                 self._estimate.add(observed_paths(known_alone(batch, self.task), self._located))
         last = self._iteration == self.iterations
         due = last or self._iteration % self._every == 0
-        again = self._chooses and self._iteration % (self.cfg.plan_every or 1) == 0
-        if again or (due and self._paths is None):
+        renews = self._chooses and not last and self._iteration % (self.cfg.plan_every or 1) == 0
+        if renews or (due and self._paths is None):
             self._estimate.fit(self.cfg.rounds * (_LAST if last else 1))
         if due:
             plan = self._plan_moves(last) if self._paths is None else self._plan_paths(last)
             self.actor = as_policy(self.task, plan)
-        if again and not last and self._spent[0] >= self._warm_up:
+        if renews and self._spent[0] >= self._warm_up:
             self._draw()
         return self._diagnostics()
 

@@ -33,7 +33,7 @@ _FACTOR = 0x9E3779B97F4A7C15
 _LONGEST_WAIT = 16
 """Misses of the safe action up to which the cells in between are inferred."""
 EM_ROUNDS = 400
-"""Rounds of expectation-maximisation, from the moves seen alone: the result does not depend on earlier ones."""
+"""Rounds of expectation-maximisation at most, from the moves seen alone: the result does not depend on earlier ones."""
 
 
 def observed_paths(batch: TensorDictBase, task: Task, *, last: bool = False) -> ObservedPaths:

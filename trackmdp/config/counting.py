@@ -63,6 +63,10 @@ class ModelBasedConfig(EveryTaskConfig):
         words=("all", "none"),
     )
 
+    def chooses(self, budget: int | None) -> bool:
+        """Whether it learns from chosen sets, not with all sensors on."""
+        return self.sensing == "chosen" or budget is not None
+
     def check(self, key: str, root: Any) -> None:
         """All sensors keep to no budget; where a detection reveals the mode, cells do not move alike."""
         if self.sensing == "all" and root.cost.budget is not None:
@@ -85,8 +89,7 @@ class ModelBasedConfig(EveryTaskConfig):
 
     def needs(self, task: Sizes, root: Any) -> dict[str, int]:
         """The paths, and the gains of each detection that may be on them; the table of chosen sets."""
-        chosen = self.sensing == "chosen" or root.cost.budget is not None
-        found = {"grid.size": renewed_table(task)} if chosen else {}
+        found = {"grid.size": renewed_table(task)} if self.chooses(root.cost.budget) else {}
         if task.markov or self.estimate == "moves":
             return found
         per_frame = (task.t_max + 3) ** task.order * (task.t_max + 2) * 12

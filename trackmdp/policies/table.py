@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.arrays.entries import ones_at, short_indices
-from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
+from trackmdp.arrays.types import AnyArray, Array, BoolArray
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, decimal, grid_words
 from trackmdp.sensing.coverage import reported, shared_out
@@ -359,21 +359,25 @@ def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
         sets = sets.astype(np.bool_ if np.isin(sets.data, (0, 1)).all() else np.float64)
     sets.sum_duplicates()  # sorts the columns of each row as well
     sets.eliminate_zeros()
-    for begin in range(0, sets.nnz, _AT_ONCE):
-        _check_choosable(task, sets, np.arange(begin, min(begin + _AT_ONCE, sets.nnz)))
+    _check_choosable(task, sets)
     return sets
 
 
-def _check_choosable(task: Task, sets: sparse.csr_array, places: IndexArray) -> None:
-    """Refuse sensors, among those at some `places` of the entries, that cannot be chosen."""
-    # The row of an entry is the last one that begins at or before it: indptr = (0, 2, 2, 5), place 2 is in row 2.
-    row = np.searchsorted(sets.indptr, places, side="right") - 1
-    start, sensors = task.keys.cell(row // task.num_choices), sets.indices[places]
-    possible = task.choosable(start, sensors)
-    if possible is not None and not possible.all():
-        x, sensor = int(start[~possible][0]), int(sensors[~possible][0])
-        why = f"with grid.window={task.window}" if task.available[sensor] else "for there is none"
-        raise UserError(f"policy: sensor {sensor} cannot be chosen from cell {x}, {why}")
+def _check_choosable(task: Task, sets: sparse.csr_array) -> None:
+    """Refuse sets with sensors that cannot be chosen."""
+    if task.window is None and task.available.all():
+        return
+    for begin in range(0, sets.nnz, _AT_ONCE):
+        places = np.arange(begin, min(begin + _AT_ONCE, sets.nnz))
+        # An entry's row is the last one that begins at or before it: indptr = (0, 2, 2, 5), place 2 is in row 2.
+        row = np.searchsorted(sets.indptr, places, side="right") - 1
+        start, sensors = task.keys.cell(row // task.num_choices), sets.indices[places]
+        possible = task.choosable(start, sensors)
+        if possible is not None and not possible.all():
+            x, sensor = int(start[~possible][0]), int(sensors[~possible][0])
+            missing = not task.available[sensor]
+            why = "for there is none" if missing else f"with grid.window={task.window}"
+            raise UserError(f"policy: sensor {sensor} cannot be chosen from cell {x}, {why}")
 
 
 def _choosable_sets(task: Task, probability: float) -> sparse.csr_array:

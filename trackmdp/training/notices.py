@@ -55,18 +55,14 @@ def poor(
     found, name = [], max(others, key=lambda each: others[each])
     if others[name] > aihtr + (slack := 1e-6 * max(1.0, abs(aihtr))):
         # A policy of less memory, learned from the same tracks, is named by its option.
-        advice = (
-            f"try {name}"
-            if name.startswith("task.memory=")
-            else _help(config, task.budget is not None)
-        )
+        advice = f"try {name}" if name.startswith("task.memory=") else _help(config, task)
         found.append(
             f"warning: {name} earns {others[name]:,.3f}, more than the learned policy; {advice}"
         )
     elif regret > (_NEAR if single else FAR) * task.reward:
         why = f" ({_SINGLE})" if single else ""
         said = f"warning: {regret:.3f} per step below the best policy known{why}"
-        found.append(f"{said}; {_help(config, task.budget is not None)}")
+        found.append(f"{said}; {_help(config, task)}")
     elif single and math.isnan(regret):
         found.append(f"note: {_SINGLE}; compare with algo=model_based")
     if config.algo.name == "model_based" and task.budget is not None and not task.markov:
@@ -77,11 +73,11 @@ def poor(
     return found
 
 
-def _help(config: TrainConfig, budget: bool) -> str:
+def _help(config: TrainConfig, task: Task) -> str:
     """The option that helps most."""
     algo = config.algo.name
     if algo in ("a2c", "ppo", "dqn"):
-        others = "" if budget else f"algo={algo}_per_sensor or "
+        others = f"algo={algo}_per_sensor or " if task.budget is None else ""
         return f"try more collector.total_frames, {others}algo=model_based"
     if algo != "model_based":
         return "try algo=model_based"
