@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import tracemalloc
+from typing import Any
 
 import numpy as np
 import pytest
@@ -163,6 +164,26 @@ def test_sets_that_never_show_some_moves_still_tell_them() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("shown", "least", "most"), [(set(), 49, 400), ({0, 1, 2}, 2, 12)])
+def test_rounds_go_on_until_the_counts_settle(
+    shown: set[int], least: int, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every path hides one cell. It may be any, which takes many rounds, or must be the one that three others left."""
+    rounds = []
+
+    def counted(*given: Any) -> Any:
+        rounds.append(expected_moves(*given))
+        return rounds[-1]
+
+    monkeypatch.setattr(kernel_estimate, "expected_moves", counted)
+    estimate = KernelEstimate(2, weight=0.1, exit_weight=1.0)
+    estimate.add(paths_of([(start, [shown], end) for start, _, end in simulated(2000, 3)]))
+    estimate.fit(400)
+    assert least <= len(rounds) <= most
+    moved = abs(rounds[-1] - rounds[-2]).sum() / estimate.counts.sum()
+    assert moved < 1e-4
+
+
 def test_samples_spread_around_the_mean_as_counts_allow() -> None:
     estimate = KernelEstimate(2, weight=1e-6, exit_weight=1e-6)
     estimate.add(paths_of([(0, [], 1)] * 30 + [(0, [], 2)] * 60 + [(0, [], 4)] * 10))
