@@ -163,7 +163,6 @@ def test_sets_that_never_show_some_moves_still_tell_them() -> None:
     np.testing.assert_allclose(estimate.mean().toarray()[:, :4], KERNEL, atol=0.03)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("shown", "least", "most"), [(set(), 49, 400), ({0, 1, 2}, 2, 12)])
 def test_rounds_go_on_until_the_counts_settle(
     shown: set[int], least: int, most: int, monkeypatch: pytest.MonkeyPatch
@@ -184,6 +183,7 @@ def test_rounds_go_on_until_the_counts_settle(
     assert moved < 1e-4
 
 
+@pytest.mark.slow
 def test_samples_spread_around_the_mean_as_counts_allow() -> None:
     estimate = KernelEstimate(2, weight=1e-6, exit_weight=1e-6)
     estimate.add(paths_of([(0, [], 1)] * 30 + [(0, [], 2)] * 60 + [(0, [], 4)] * 10))
