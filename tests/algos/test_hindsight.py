@@ -72,14 +72,14 @@ def test_updates_grow_with_the_rows(words: tuple[str, ...], t_max: int, expected
 
 def test_keys_of_three_detections_take_fewer_updates_and_smaller_nets() -> None:
     cfg, task = train_config("algo=hindsight").algo, Task(3, cost=0.1, t_max=1, markov=False)
-    assert budget(replace(task, memory="displacement_gap"), cfg) == (800, 256)
-    assert budget(replace(task, memory="two_displacements"), cfg) == (500, 64)
+    assert budget(replace(task, memory="displacement_gap"), cfg) == (400, 256)
+    assert budget(replace(task, memory="two_displacements"), cfg) == (400, 64)
 
 
 def test_credit_per_sensor_takes_more_updates_but_with_a_memory() -> None:
     cfg, task = train_config("algo=a2c_per_sensor").algo, Task(10, cost=0.1, t_max=4, markov=False)
     found = [budget(replace(task, memory=memory), cfg)[0] for memory in ("cell", "displacement")]
-    assert found == [1280, 800]
+    assert found == [1280, 400]
 
 
 def test_a_target_that_goes_farther_than_the_nets_see_is_gone() -> None:

@@ -69,8 +69,8 @@ def budget(task: Task, cfg: PerSensorConfig) -> tuple[int, int]:
     if task.num_keys > _MOST_CELLS_OF_NETS:
         hidden = 0
     # With a memory, plans on whole paths, which begin from the nets' policies, end no better after more updates.
-    effort = 1.0 if task.order else cfg.effort
-    updates = cfg.updates or round(effort * (500 if few else 800))
+    wanted = 400 if task.order else round(cfg.effort * (500 if few else 800))
+    updates = cfg.updates or wanted
     return updates, hidden if cfg.hidden is None else cfg.hidden
 
 
