@@ -120,14 +120,13 @@ class AdditiveDQNLoss(LossModule):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """`loss` of a batch of transitions as `n_step` makes them."""
-        chosen = joint_value(
-            self._values(tensordict, self.qvalue_network_params), tensordict["action"], self.budget
-        )
-        with torch.no_grad():
-            following = tensordict["next"]
-            value = self._values(following, self.qvalue_network_params)["sensor_value"]
-            slow = self._values(following, self.target_qvalue_network_params)
-            future = joint_value(slow, greedy(value, self.budget), self.budget)
+        net, following = self.qvalue_network, tensordict["next"]
+        with self.qvalue_network_params.to_module(net):
+            chosen = joint_value(self._values(tensordict), tensordict["action"], self.budget)
+            with torch.no_grad():
+                best = greedy(self._values(following)["sensor_value"], self.budget)
+        with torch.no_grad(), self.target_qvalue_network_params.to_module(net):
+            future = joint_value(self._values(following), best, self.budget)
             alive = ~following["terminated"].squeeze(-1)
             target = following["reward"].squeeze(-1) + tensordict["discount"] * future * alive
         error = target - chosen
@@ -137,9 +136,8 @@ class AdditiveDQNLoss(LossModule):
             {"loss": (weight * error.square()).mean(), "q_value": chosen.detach().mean()}
         )
 
-    def _values(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
-        with params.to_module(self.qvalue_network):
-            return self.qvalue_network(tensordict.select(*self.qvalue_network.in_keys))
+    def _values(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self.qvalue_network(tensordict.select(*self.qvalue_network.in_keys))
 
 
 class _ZeroedStorage(LazyTensorStorage):

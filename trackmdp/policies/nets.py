@@ -70,15 +70,19 @@ class StateEncoder(nn.Module):
         """Features of a batch of any shape `[...]`; `action_history` is `[..., t_max+1, K]`."""
         shape = last_cell.shape
         cell, n = last_cell.reshape(-1), steps_since_detection.reshape(-1)
-        features = self.cell(cell) + self.stage(n) + self.cell_and_stage(cell * self.stages + n)
+        # In place: new arrays for the sums take longer than the sums.
+        features = self.cell(cell)
+        features += self.stage(n)
+        features += self.cell_and_stage(cell * self.stages + n)
         if key is not None:
             contexts = self.keys.contexts(key.reshape(-1))[1:]
             for table, (context, _) in zip(self.known, contexts, strict=True):
-                features = features + table(context * self.stages + n)
+                features += table(context * self.stages + n)
         missed = n.nonzero().squeeze(-1)
         bits = action_history.reshape(len(cell), -1)[missed].to(features.dtype)
-        features = features.index_add(0, missed, bits @ self.history.weight.T) + self.history.bias
-        return torch.relu(features).reshape(*shape, -1)
+        features.index_add_(0, missed, bits @ self.history.weight.T)
+        features += self.history.bias
+        return features.relu_().reshape(*shape, -1)
 
 
 class StateNetwork(nn.Module):
