@@ -132,6 +132,22 @@ def test_the_bootstrap_t_resamples_the_statistic() -> None:
     )
 
 
+def test_few_units_have_the_interval_of_student() -> None:
+    """Of three units every ninth resample holds one alone, with no spread of its own."""
+    part, whole = np.array([20.0, 21.0, 28.0]), np.array([30.0, 30.0, 30.0])
+    found, rest = ratio(part, whole), part / 30 - 69 / 90
+    margin = 4.302652729911275 * rest.std(ddof=1) / math.sqrt(3)
+    assert (found.low, found.high) == pytest.approx((69 / 90 - margin, 69 / 90 + margin))
+
+
+def test_where_resamples_have_no_spread_the_interval_is_that_of_student() -> None:
+    """Seven units of .7 and one of .1: in every third resample all are alike but for rounding."""
+    part, whole = np.full(8, 0.7 * 30), np.full(8, 30.0)
+    part[0] = 3.0
+    found, margin = ratio(part, whole), 2.364624251592785 * 0.6 / 8
+    assert (found.low, found.high) == pytest.approx((0.625 - margin, 0.625 + margin))
+
+
 def test_events_that_were_never_seen_may_happen_all_the_same() -> None:
     found = ratio(np.zeros(25), np.ones(25), events=True)
     assert (found.mean, found.low) == (0.0, 0.0)

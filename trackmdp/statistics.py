@@ -16,8 +16,9 @@ Values: TypeAlias = npt.NDArray[np.float64]
 
 LEVEL = 0.95
 """Nominal coverage of every interval."""
-RESAMPLES, _MANY = 999, 2000
-"""Of the bootstrap; units above which it is not needed."""
+RESAMPLES, _FEW, _MANY = 999, 8, 2000
+"""Of the bootstrap; units below which Student's t serves, as many resamples hold one unit or two alike, whose spread is
+next to none; and units above which the bootstrap is not needed."""
 FEWEST = 3
 """Values a group needs before an interval is shown: from two, its width depends more on luck than on the spread."""
 
@@ -99,7 +100,7 @@ def ratio(part: Values, whole: Values, *, events: bool = False) -> MeanInterval:
     """Σ part / Σ whole over independent units `[n]`, such as tracks, with its bootstrap-t interval (Efron 1979).
 
     Ratios of a few dozen units are skewed, and Student's t on them covers .8 to .9 only; the bootstrap takes the shape
-    of the t statistic from the units themselves. Above `_MANY` units the normal law serves.
+    of the t statistic from the units themselves. Above `_MANY` units the normal law serves, below `_FEW` Student's t.
 
     Args:
         part: `[n]`, the sum of each unit.
@@ -132,9 +133,9 @@ def _bootstrap_t(part: Values, whole: Values, mean: float) -> tuple[float, float
     rest = part - mean * whole
     # Delta method: part/whole - mean ≈ mean(part - mean·whole) / mean(whole), a mean over n units.
     error = float(rest.std(ddof=1) / (whole.mean() * math.sqrt(count)))
-    if count > _MANY or not error:
-        margin = _student(count - 1) * error
-        return mean - margin, mean + margin
+    by_student = mean - (margin := _student(count - 1) * error), mean + margin
+    if not _FEW <= count <= _MANY or not error:
+        return by_student
     rng = np.random.default_rng(derive(0, "bootstrap"))
     # `[resamples, n]`: how often each unit is in each resample, so that all resampled sums are one matrix product. The
     # generator is seeded with a constant: the same figures give the same interval in every report.
@@ -149,10 +150,13 @@ def _bootstrap_t(part: Values, whole: Values, mean: float) -> tuple[float, float
             - 2 * ratios * (weights @ (part * whole))
             + ratios**2 * (weights @ whole**2)
         )
-        statistic = (ratios - mean) / (
-            np.sqrt(np.maximum(squares, 0.0) * count / (count - 1)) / base
-        )
-    low, high = np.quantile(statistic[np.isfinite(statistic)], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+        # Of units that are all alike rounding is left over.
+        squares[squares <= 1e-12 * (weights @ part**2)] = 0.0
+        statistic = (ratios - mean) / (np.sqrt(squares * count / (count - 1)) / base)
+    spread = np.isfinite(statistic)
+    if 1.0 - spread.mean() > (1 - LEVEL) / 2:  # the quantile would be one of those without any
+        return by_student
+    low, high = np.quantile(statistic[spread], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     # The quantiles change sides: t = (estimate - truth) / error is at most `high` exactly where truth is at least
     # estimate - high·error.
     return float(mean - high * error), float(mean - low * error)
