@@ -272,10 +272,10 @@ def begun(**more: Any) -> tm.Tracker:
 
 MISTAKES: dict[str, tuple[Any, str]] = {
     "second report": (lambda t: (t.report(0), t.report(0)), r"report: no sensors\(\) since"),
-    "outside": (lambda t: t.report(9), "report: cell is 9, expected a whole number from 0 to 8"),
-    "seen outside": (lambda t: t.sees(9), "sees: cell is 9, expected a whole number from 0 to 8"),
-    "no cell": (lambda t: t.report(False), "report: cell is False, expected"),
-    "fraction": (lambda t: t.report(0.5), "report: cell is 0.5, expected"),
+    "outside": (lambda t: t.report(9), "report: cell=9: expected an integer from 0 to 8"),
+    "seen outside": (lambda t: t.sees(9), "sees: cell=9: expected an integer from 0 to 8"),
+    "no cell": (lambda t: t.report(False), "report: cell=False: expected"),
+    "fraction": (lambda t: t.report(0.5), "report: cell=0.5: expected"),
     "off": (lambda t: t.report(5), "report: cell 5 is seen by none of the 2 sensors that are on"),
     "mode": (lambda t: t.report(4, mode=1), "report: mode=1, expected none"),
     "mode of nothing": (lambda t: t.report(None, mode=1), "report: mode=1 without a cell"),
@@ -283,7 +283,7 @@ MISTAKES: dict[str, tuple[Any, str]] = {
     "exited twice": (lambda t: (t.exited(), t.exited()), r"exited\(\): the target has exited"),
     "after the exit": (lambda t: (t.exited(), t.report(0)), "report: the target has exited"),
     "start": (lambda _: begun(mode=1), "tracker: mode=1, expected none"),
-    "seed": (lambda _: begun(seed=-1), "tracker: seed is -1, expected a whole number >= 0"),
+    "seed": (lambda _: begun(seed=-1), "tracker: seed=-1: expected an integer >= 0"),
 }
 
 
@@ -308,19 +308,17 @@ def test_modes_are_asked_for_where_detections_give_them() -> None:
     policy = some(WORLDS["mode"])
     with pytest.raises(UserError, match=r"^tracker: mode=None, expected one of 0 \.\.\. 7$"):
         policy.tracker(0)
-    with pytest.raises(
-        UserError, match=r"^tracker: mode is 8, expected a whole number from 0 to 7"
-    ):
+    with pytest.raises(UserError, match=r"^tracker: mode=8: expected an integer from 0 to 7"):
         policy.tracker(0, mode=8)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"key": 99}, "state: key is 99, expected a whole number from 0 to 8"),
-        ({"misses": 3}, "state: misses is 3, expected a whole number from 0 to 2"),
-        ({"misses": None}, "state: misses is None, expected"),
-        ({"on": [9]}, "state: on is 9, expected a whole number from 0 to 8"),
+        ({"key": 99}, "state: key=99: expected an integer from 0 to 8"),
+        ({"misses": 3}, "state: misses=3: expected an integer from 0 to 2"),
+        ({"misses": None}, "state: misses=None: expected"),
+        ({"on": [9]}, "state: on=9: expected an integer from 0 to 8"),
         ({"on": 3}, "state: expected a list or None as on"),
         ({"exited": 1}, "state: expected a list or None as on, True or False as exited"),
         ({"task": {}}, "state: made for {}, expected {'size': "),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -107,3 +108,15 @@ def test_a_file_of_prices_is_nan_where_there_is_no_sensor(name: str, tmp_path: P
 def test_an_array_of_another_grid_is_refused_by_its_rows_and_columns(name: str) -> None:
     with pytest.raises(UserError, match=f"^{name}: 3 x 2 numbers, expected 2 x 3"):
         make_world("random_walk", size=(2, 3), **{name: np.full((3, 2), 0.5)})
+
+
+@pytest.mark.parametrize(("word", "grid"), [("cost", (3, 4)), ("detection", (3, 4)), ("cost", 6)])
+def test_a_file_of_another_grid_is_refused_by_its_rows_and_columns(
+    word: str, grid: Any, tmp_path: Path
+) -> None:
+    """Transposed, its numbers would be those of other cells."""
+    np.save(tmp_path / "a.npy", np.full((4, 3), 0.5))
+    with pytest.raises(UserError, match=r"a.npy: 4 x 3 numbers, expected one number or .* x"):
+        make_world("random_walk", size=grid, **{word: str(tmp_path / "a.npy")})
+    np.save(tmp_path / "row.npy", np.full((1, 12), 0.5))
+    assert make_world("random_walk", size=(3, 4), cost=str(tmp_path / "row.npy")).cost[11] == 0.5

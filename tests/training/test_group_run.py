@@ -208,21 +208,21 @@ def test_episodes_are_logged_while_learning_and_verify_to_the_bit(
         assert verify(reader, numbers=[13]).difference is None
 
 
-class AtTheFirst(TensorDictModuleBase):
-    """The sensor of the cell where target 0 was located last."""
+class BelowTheFirst(TensorDictModuleBase):
+    """The sensor of the cell below the one where target 0 was located last."""
 
     in_keys = ("last_cell",)
     out_keys = ("action",)
 
     def forward(self, state: TensorDictBase) -> TensorDictBase:
-        return state.set("action", torch.arange(9) == state["last_cell"][:, :1])
+        return state.set("action", torch.arange(9) == state["last_cell"][:, :1] + 3)
 
 
 def test_a_tracker_begins_with_each_target_in_its_cell() -> None:
-    tracker = JointRule(group(), AtTheFirst(), torch.device("cpu")).tracker([0, 4])
-    assert tracker.sensors() == [0]
-    tracker.report([3, None])
+    tracker = JointRule(group(), BelowTheFirst(), torch.device("cpu")).tracker([0, 4])
     assert tracker.sensors() == [3]
+    tracker.report([3, None])
+    assert tracker.sensors() == [6]
 
 
 def test_a_loaded_run_follows_targets_step_by_step(tmp_path: Path) -> None:

@@ -57,8 +57,11 @@ def per_cell(
     count, each = (math.prod(grid_size(size)), "cell") if sensors is None else (sensors, "sensor")
     if not isinstance(given, str):
         return one_each(key, given, count, each, allowed)
-    values = read_numbers(key, given, name=key.rpartition(".")[2]).ravel()
-    return one_each(f"{key}={given}", values, count, each, allowed)
+    values = read_numbers(key, given, name=key.rpartition(".")[2])
+    # A row or a column of numbers in a .csv file is a list.
+    values = values.ravel() if 1 in values.shape else values
+    grid = grid_size(size) if sensors is None else sensors
+    return one_each(f"{key}={given}", values, grid, each, allowed)
 
 
 def read_numbers(key: str, path: str | Path, *, name: str) -> Array:

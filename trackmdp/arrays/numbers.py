@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -37,13 +38,15 @@ def one_each(
     Raises:
         UserError: another number of numbers, or one out of range.
     """
-    values = np.asarray(given, dtype=np.float64)
+    values, rows = np.asarray(given, dtype=np.float64), ""
     if isinstance(count, tuple):
+        rows = f", or {count[0]} x {count[1]}"
         values = values.ravel() if values.shape == count else values
         count = math.prod(count)
     if values.shape not in ((), (count,)):
-        found = f"{values.size} values" if values.ndim < 2 else f"an array {list(values.shape)}"
-        raise UserError(f"{source}: {found}, expected one number or {count} (one per {each})")
+        table = " x ".join(map(str, values.shape)) + " numbers"
+        found = f"{values.size} values" if values.ndim < 2 else table
+        raise UserError(f"{source}: {found}, expected one number or {count} (one per {each}){rows}")
     within, expected = allowed
     if not (fine := np.asarray(within(values))).all():
         bad = int(np.flatnonzero(~fine)[0])
@@ -51,9 +54,14 @@ def one_each(
     return np.broadcast_to(values, (count,)).copy()
 
 
-def whole_number(name: str, value: int, lowest: int, most: float = math.inf) -> int:
+def whole_number(name: str, value: Any, lowest: int, most: float = math.inf) -> int:
     """A value that is an integer in its range; else a `UserError` with its name."""
-    if not isinstance(value, (int, np.integer)) or not lowest <= value <= most:
+    try:
+        # False is 0 to Python: report(False) would be a detection in cell 0.
+        number = None if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or not lowest <= number <= most:
         expected = f">= {lowest}" if most == math.inf else f"from {lowest} to {most:,}"
         raise UserError(f"{name}={value}: expected an integer {expected}")
-    return int(value)
+    return number

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import operator
+import math
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
+from trackmdp.arrays.numbers import whole_number
 from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.errors import UserError
 from trackmdp.policies.belief import BeliefFilter
@@ -82,7 +83,7 @@ class Tracker:
         self._exited = False
         self._filter = None if world is None else BeliefFilter(world.kernel, world.modes)
         self._belief: Array = np.zeros((1, 0))  # [1, Z] where the motion is known
-        self._seed = _number("tracker: seed", seed)
+        self._seed = whole_number("tracker: seed", seed, 0)
         found = self._one("tracker", cell, at)
         if found is None:
             raise UserError("tracker: no cell and no at, expected the first detection")
@@ -151,7 +152,7 @@ class Tracker:
         Raises:
             UserError: the cell is outside the grid.
         """
-        return bool(self._seen()[_number("sees: cell", cell, self._task.num_cells - 1)])
+        return bool(self._seen()[whole_number("sees: cell", cell, 0, self._task.num_cells - 1)])
 
     def _seen(self) -> BoolArray:
         """`[M]` whether a sensor that is on covers a cell."""
@@ -234,11 +235,17 @@ class Tracker:
             raise UserError(f"state: made for {state['task']}, expected {tracker._facts()}")
         most = {"key": task.num_keys - 1, "misses": task.num_choices}
         for name in _NUMBERS:
-            setattr(tracker, f"_{name}", _number(f"state: {name}", state[name], most.get(name)))
+            setattr(
+                tracker,
+                f"_{name}",
+                whole_number(f"state: {name}", state[name], 0, most.get(name, math.inf)),
+            )
         on, last = state["on"], task.total_sensors - 1
         if not isinstance(on, list | None) or not isinstance(state["exited"], bool):
             raise UserError("state: expected a list or None as on, True or False as exited")
-        tracker._on = None if on is None else [_number("state: on", each, last) for each in on]
+        tracker._on = (
+            None if on is None else [whole_number("state: on", each, 0, last) for each in on]
+        )
         tracker._exited = state["exited"]
         if tracker._filter is not None:
             belief, states = state["belief"], tracker._belief.shape[1]
@@ -268,11 +275,11 @@ class Tracker:
     def _locate(self, call: str, cell: int, mode: int | None, *, first: bool = False) -> None:
         """Note a detection; nothing is changed where it is refused."""
         task, keys = self._task, self._task.keys
-        place = np.int64(_number(f"{call}: cell", cell, task.num_cells - 1))
+        place = np.int64(whole_number(f"{call}: cell", cell, 0, task.num_cells - 1))
         if (mode is not None) != (keys.modes > 1):
             wanted = f"one of 0 ... {keys.modes - 1}" if keys.modes > 1 else "none"
             raise UserError(f"{call}: mode={mode}, expected {wanted}")
-        own = 0 if mode is None else _number(f"{call}: mode", mode, keys.modes - 1)
+        own = 0 if mode is None else whole_number(f"{call}: mode", mode, 0, keys.modes - 1)
         if not (first or self.sees(int(place))):
             raise UserError(
                 f"{call}: cell {cell} is seen by none of the {len(self._on or ())} sensors that are on, expected "
@@ -320,20 +327,3 @@ def _checked(world: Any, task: Task) -> Any:
     if world is not None and (not hasattr(world, "kernel") or world.size != task.size):
         raise UserError(f"tracker: world: expected a World of {task.rows} x {task.columns} cells")
     return world
-
-
-def _number(name: str, value: Any, most: int | None = None) -> int:
-    """A whole number from 0 to `most`.
-
-    Raises:
-        UserError: it is none.
-    """
-    try:
-        # False is 0 to Python: report(False) would be a detection in cell 0.
-        number = -1 if isinstance(value, bool) else operator.index(value)
-    except TypeError:
-        number = -1
-    if number < 0 or (most is not None and number > most):
-        wanted = "a whole number >= 0" if most is None else f"a whole number from 0 to {most}"
-        raise UserError(f"{name} is {value!r}, expected {wanted}")
-    return number

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
+from trackmdp.arrays.numbers import whole_number
+from trackmdp.arrays.types import BoolArray, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.solvers.several.merging import Beliefs, Rule, followed
 
@@ -34,11 +37,11 @@ class GroupTracker:
     def __init__(self, policy: Rule, cells: Sequence[int]) -> None:
         self._policy, self._group = policy, policy.group
         count, self._cells = len(self._group), policy.task.num_cells
-        if len(cells) != count or not all(0 <= cell < self._cells for cell in cells):
-            raise UserError(
-                f"cells={list(cells)}: expected {count}, each from 0 to {self._cells - 1}"
-            )
-        located = np.asarray(cells, dtype=np.int64) + self._group.kind * self._cells
+        found = [
+            whole_number("tracker: cell", cell, 0, self._cells - 1)
+            for cell in _each(cells, "tracker", count)
+        ]
+        located = np.array(found) + self._group.kind * self._cells
         self._clocks = policy.start(located[None])
         self._beliefs = Beliefs.at(np.arange(count), located)
 
@@ -74,22 +77,51 @@ class GroupTracker:
             gone: numbers of targets that have left the grid in this step.
 
         Raises:
-            UserError: a cell is none of the grid, a target that has left is detected, or one is missed that cannot be.
+            UserError: a cell is none of the grid or seen by no sensor that is on, a target that has left is detected,
+                or one is missed that cannot be; or `gone` has no numbers of targets.
         """
-        before = self._clocks
-        present = before.present[0] & ~np.isin(np.arange(len(before.present[0])), list(gone))
+        before, count = self._clocks, len(self._group)
+        left = [
+            whole_number("report: gone", each, 0, count - 1) for each in _each(gone, "report: gone")
+        ]
+        present = before.present[0] & ~np.isin(np.arange(count), left)
+        cells = _each(cells, "report", count)
         seen = np.array([cell is not None for cell in cells])
-        if len(seen) != len(present) or (seen & ~present).any():
-            raise UserError(
-                f"report({list(cells)}): expected a cell or None for each target, None once it has left"
-            )
-        place = np.array([0 if cell is None else cell for cell in cells])
-        if not ((place >= 0) & (place < self._cells)).all():
-            raise UserError(f"report({list(cells)}): expected cells from 0 to {self._cells - 1}")
+        if (seen & ~present).any():
+            raise UserError(f"report({cells}): expected None for a target that has left")
+        place = np.array(
+            [
+                0 if cell is None else whole_number("report: cell", cell, 0, self._cells - 1)
+                for cell in cells
+            ]
+        )
         on, moved = np.array(self.sensors(), dtype=np.int64), self._beliefs.moved(self._group)
+        if not self.safe and (seen & ~self._seen_by(on)[place]).any():
+            raise UserError(
+                f"report({cells}): a cell is seen by none of the {len(on)} sensors that are on, expected "
+                "one that is, or None"
+            )
         states, reports = place + self._group.kind * self._cells, (present[None], seen[None])
         clocks, beliefs = followed(self._group, before, moved, on, states[None], reports)
         lost = np.setdiff1d(np.flatnonzero(present & ~seen), beliefs.row)
         if len(lost) and self._group.recorded is None:  # a track may make moves that no other made
             raise UserError(f"report: target {lost[0]} is missed where it would have been detected")
         self._clocks, self._beliefs = clocks, beliefs
+
+    def _seen_by(self, on: IndexArray) -> BoolArray:
+        """`[M]`, cells that some of the sensors see."""
+        seen: BoolArray = self._policy.task.sees_by_cell[:, on].sum(axis=1) > 0
+        return seen
+
+
+def _each(given: Any, call: str, count: int | None = None) -> list[Any]:
+    """The items of a sequence.
+
+    Raises:
+        UserError: it is none, or not one of `count` items.
+    """
+    found = list(given) if isinstance(given, Iterable) and not isinstance(given, str) else None
+    if found is None or (count is not None and len(found) != count):
+        wanted = "a sequence" if count is None else f"{count}, one for each target"
+        raise UserError(f"{call}({given!r}): expected {wanted}")
+    return found
