@@ -38,6 +38,8 @@ def whole_file(file: Path) -> Iterator[BufferedRandom]:
     Where `file` is a symbolic link, the link is replaced, and its target stays as it is.
     """
     part = _part(file)
+    if not file.parent.is_dir():  # else the message would name the hidden file
+        raise FileNotFoundError(errno.ENOENT, "no such folder", str(file.parent))
     with create(part) as stream:
         try:
             yield stream

@@ -50,7 +50,7 @@ def export(policy: Any, file: str | Path, *, value: Array | None = None, label: 
     place, table = Path(file), adapted(None, policy)
     if not isinstance(table, PolicyTable):
         raise UserError(
-            f"export: a {type(policy).__name__}, expected a Policy, a Run or a Solution"
+            f"export: a {type(policy).__name__}, expected a policy of one target: a Policy, a Run or a Solution"
         )
     if value is None:
         value = getattr(getattr(policy, "evaluation", None), "value", None)
