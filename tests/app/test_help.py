@@ -49,6 +49,9 @@ def test_help_fits_a_screen(command: str, capsys: pytest.CaptureFixture[str]) ->
     for group in set(options(ROOTS[command])) & set(GROUPS):
         assert all(name in text for name in GROUPS[group])
     assert f"trackmdp {command} --help all lists every option" in text
+    # Of a choice only where there are any.
+    choices = bool(set(options(ROOTS[command])) & set(GROUPS))
+    assert ("Choices" in lines, "kernel=random_walk --help" in text) == (choices, choices)
 
 
 def test_a_module_run_by_python_is_the_command() -> None:

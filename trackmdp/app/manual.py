@@ -123,13 +123,17 @@ def _most_used(command: str, values: dict[str, Any]) -> Iterator[str]:
     known = known_options(values, ROOTS[command])
     for key in USED[command]:
         yield from _described(f"{key}={_shown(key, at_key(values, key))}", known[key].help)
+    every = f"trackmdp {command} --help all lists every option with its range and unit"
+    groups = [key for key in values if key in GROUPS]
+    if not groups:
+        yield from ("", f"{every}.")
+        return
     yield from ("", "Choices")
-    for key in values:
-        if key in GROUPS:
-            yield from _wrapped(f"  {_offered(key, values)}")
+    for key in groups:
+        yield from _wrapped(f"  {_offered(key, values)}")
     yield from (
         "",
-        f"trackmdp {command} --help all lists every option with its range and unit,",
+        f"{every},",
         *_wrapped(f"trackmdp {command} kernel=random_walk --help those of a choice."),
     )
 
