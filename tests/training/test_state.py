@@ -333,3 +333,15 @@ def test_weights_are_taken_where_they_fit(
     )
     assert "none of its weights has the name and shape of one of ours" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
+
+
+def test_a_run_without_weights_is_named_by_its_option(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "empty").mkdir()
+    for name, message in (("none", "no such folder"), ("empty", "no checkpoint in ")):
+        given = f"init_from={tmp_path / name}"
+        assert typed(tmp_path / "new", given) == 2
+        error = capsys.readouterr().err
+        assert error.startswith(f"trackmdp train: {given}: {message}") and error.count("\n") == 1
+        assert not (tmp_path / "new").exists()

@@ -73,16 +73,18 @@ def available_checkpoints(folder: Path) -> list[Path]:
     )
 
 
-def newest(run: Path) -> Path:
-    """The newest checkpoint of a run folder.
+def newest(run: Path, key: str = "run") -> Path:
+    """The newest checkpoint of a run folder, which the option `key` names.
 
     Raises:
-        UserError: the run has none.
+        UserError: there is no such folder, or no checkpoint in it.
     """
+    if not run.is_dir():
+        raise UserError(f"{key}={run}: no such folder")
     files = available_checkpoints(run / "checkpoints")
     if not files:
         raise UserError(
-            f"run={run}: no checkpoint in {run / 'checkpoints'}; the run has not saved one yet"
+            f"{key}={run}: no checkpoint in {run / 'checkpoints'}; the run has not saved one yet"
         )
     return files[0]
 

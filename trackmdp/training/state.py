@@ -103,9 +103,9 @@ def take_weights(algorithm: Algorithm, run: Path, device: torch.device) -> list[
     """Start from the weights of another run's newest checkpoint, where name and shape fit; returns the names taken.
 
     Raises:
-        UserError: the run has no checkpoint, or nothing of it fits.
+        UserError: there is no such run, it has no checkpoint, or nothing of it fits.
     """
-    file = checkpoint.newest(run)
+    file = checkpoint.newest(run, "init_from")
     state = checkpoint.load(file, device)
     own, taken = algorithm.state_dict(), []
     with torch.no_grad(), decoded(str(file), "the weights of a run"):
