@@ -125,6 +125,12 @@ class EpisodeLog:
                 self._writer, whole = None, True
         return whole
 
+    def abandon(self) -> None:
+        """End logging; the steps written stay under the `.part` name."""
+        if self._writer is not None:
+            self._writer.abandon()
+            self._writer = None
+
     @contextmanager
     def _over_at_failure(self) -> Iterator[None]:
         """If the file fails, report it, and end logging."""
@@ -134,9 +140,7 @@ class EpisodeLog:
         except Exception as error:
             part = self.file.with_name(f"{self.file.name}.part")
             self._tell(f"{part}: {reason(error)}; no more episodes are logged")
-            if self._writer is not None:
-                self._writer.abandon()
-                self._writer = None
+            self.abandon()
 
 
 class EpisodeLogger(Callback):

@@ -380,6 +380,23 @@ def test_an_evaluation_outlives_its_log(
     assert (tmp_path / "evaluation.json").is_file()
 
 
+def test_ctrl_c_while_logging_names_the_part_and_how_to_save_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(writer: EpisodeWriter) -> Path:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(EpisodeWriter, "finish", stopped)
+        assert main([*LOGGED, f"hydra.run.dir={tmp_path}"]) == 130
+    said, last = capsys.readouterr().err.splitlines()
+    assert last == "trackmdp evaluate: interrupted"
+    part = tmp_path / "episodes.mcap.part"
+    assert said.startswith(f"trackmdp evaluate: {part}: cut off")
+    assert main(said.split("`")[1].split()[1:]) == 0
+    assert "30 episodes" in capsys.readouterr().out
+
+
 def test_a_file_that_may_not_grow_leaves_what_was_flushed(log: Path, tmp_path: Path) -> None:
     from trackmdp.episodes.recover import recover
 

@@ -178,8 +178,15 @@ def _log(
     log = EpisodeLog(
         folder, episodes.problem, seed=cfg.seed, config=config, layout=mcap.layout, tell=_tell
     )
-    log.add(episodes, {"label": subject})
-    if log.close():
+    try:
+        log.add(episodes, {"label": subject})
+        whole = log.close()
+    except KeyboardInterrupt:
+        log.abandon()
+        part = f"{log.file}.part"
+        _tell(f"{part}: cut off; `trackmdp replay file={part} recover=true` saves its episodes")
+        raise
+    if whole:
         along = " along held-out tracks" if episodes.problem.recorded else ""
         console.print(f"{log.episodes} episodes{along} in {log.file}")
 
