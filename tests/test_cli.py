@@ -92,6 +92,8 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         ("train hydra.run.dir=${nope}", "hydra.run.dir: Interpolation key 'nope' not found"),
         ("train hydra.run.dir=${nope:1}", "hydra.run.dir: Unsupported interpolation type nope"),
         ("train -m seed=0,1 hydra.sweep.dir=???", "hydra.sweep.dir: missing, expected a folder"),
+        ("solve grid.size=3 hydra.run.dir=", "hydra.run.dir=: empty, expected a folder"),
+        ("solve -m seed=0,1 hydra.sweep.dir=", "hydra.sweep.dir=: empty, expected a folder"),
         (
             f"train hydra.run.dir={LONG}",
             f"hydra.run.dir={LONG}: expected a folder that can be written to",

@@ -216,7 +216,7 @@ def folder_of(cfg: DictConfig, key: str) -> Path:
     """The folder at a dotted key, such as ``hydra.run.dir``, its interpolations resolved.
 
     Raises:
-        UserError: it is missing or no folder's name, or an interpolation in it leads nowhere.
+        UserError: it is missing, empty or no folder's name, or an interpolation in it leads nowhere.
     """
     try:
         value = OmegaConf.select(cfg, key)  # None for a missing key, and for "???"
@@ -224,6 +224,8 @@ def folder_of(cfg: DictConfig, key: str) -> Path:
         raise UserError(f"{key}: {message_of(error)}") from error
     if not isinstance(value, str):
         raise UserError(f"{key}: missing, expected a folder")
+    if not value:  # an unset variable of the shell; to `Path` it is the current folder
+        raise UserError(f"{key}=: empty, expected a folder")
     folder = Path(value)
     try:
         # Asked for its error alone: a name that is too long, or a folder that may not be looked into, is refused here
