@@ -66,7 +66,9 @@ def _run_once(compose: Composer) -> int:
         raise UserError("resume=auto: expected hydra.run.dir=FOLDER beside it, the run's own")
     # All checks come first, so that a mistyped line leaves no folder behind.
     ready = prepare(compose.command, cfg, run_words(compose.words))
-    made = make_folder("hydra.run.dir", ready.folder)
+    # Files of a replay have names of their own, most of them elsewhere.
+    written = compose.command != "replay"
+    made = make_folder("hydra.run.dir", ready.folder, written=written)
     # Hydra marks its part read-only once it is composed.
     with read_write(cfg.hydra):
         cfg.hydra.run.dir = str(ready.folder)  # a run that is resumed writes to its own

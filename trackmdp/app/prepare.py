@@ -238,11 +238,12 @@ def folder_of(cfg: DictConfig, key: str) -> Path:
     return folder
 
 
-def make_folder(key: str, folder: Path) -> list[Path]:
+def make_folder(key: str, folder: Path, *, written: bool = True) -> list[Path]:
     """Make `folder`; returns the folders that were not there before, the innermost first.
 
     Raises:
-        UserError: it cannot be made or written to. Nothing is left behind then.
+        UserError: it cannot be made, or not be written to though `written` says that it is to be. Nothing is left
+            behind then.
     """
     # Noted before anything is made, so that exactly these are taken away again.
     path = folder.absolute()
@@ -250,7 +251,7 @@ def make_folder(key: str, folder: Path) -> list[Path]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # A folder that was there already may be read-only: mkdir does not complain, the first file would.
-        if not os.access(folder, os.W_OK | os.X_OK):
+        if written and not os.access(folder, os.W_OK | os.X_OK):
             raise PermissionError(errno.EACCES, "it cannot be written to")
     except OSError as error:
         remove_if_empty(made)

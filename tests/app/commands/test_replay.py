@@ -299,6 +299,24 @@ def test_mistakes_end_in_one_line(
     assert not list(tmp_path.iterdir())
 
 
+def test_a_log_is_read_from_a_folder_that_cannot_be_written_to(
+    log: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "locked").mkdir()
+    monkeypatch.chdir(tmp_path / "locked")
+    # Permission bits do not bind root, who may run the tests.
+    monkeypatch.setattr(os, "access", lambda path, _: Path(path).resolve() != Path.cwd())
+    for words in ([], ["verify=true"], [f"html={tmp_path / 'x.html'}"]):
+        status, _, error = replay(capsys, f"file={log}", *words)
+        assert (status, error) == (0, "")
+    assert (tmp_path / "x.html").is_file()
+    assert main(["solve", "grid.size=3", "hydra.run.dir=."]) == 2
+    assert "expected a folder that can be written to" in capsys.readouterr().err
+
+
 def test_playback_issues_the_actions_again(log: Path, tmp_path: Path) -> None:
     words = [
         "evaluate",
