@@ -19,6 +19,7 @@ from tests.typed import ENVIRONMENT, ROOT, refused, stub, typed
 from trackmdp.app.cli import COMMANDS, main
 from trackmdp.config import GROUPS, ROOTS, options
 from trackmdp.errors import Preempted, RunError, UserError
+from trackmdp.solvers import optimal
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -324,6 +325,26 @@ sys.exit(main(["train"]))
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=60)
     assert (process.returncode, said) == (130, "trackmdp train: interrupted\n")
+    assert not list(empty_folder.iterdir())
+
+
+@pytest.mark.parametrize("kernel", ["random_support", "heading"])
+@pytest.mark.parametrize("command", ["evaluate", "compare"])
+def test_ctrl_c_in_the_search_for_a_baseline_writes_nothing(
+    command: str,
+    kernel: str,
+    monkeypatch: pytest.MonkeyPatch,
+    empty_folder: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def search(run: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(optimal._Run, "search", search)
+    baselines = ["baseline=optimal", *(["baseline=none"] if command == "compare" else [])]
+    words = [*baselines, f"kernel={kernel}", "grid.size=3", "quiet=true"]
+    assert main([command, *words, "hydra.run.dir=a"]) == 130
+    assert capsys.readouterr() == ("", f"trackmdp {command}: interrupted\n")
     assert not list(empty_folder.iterdir())
 
 

@@ -207,6 +207,7 @@ def baseline_policy(problem: Problem, choice: BaselineConfig) -> Policy:
 
     Raises:
         UserError: it needs a motion model, and recorded tracks have none.
+        KeyboardInterrupt: Ctrl-C ended its search, whose policy so far is not the baseline.
     """
     from trackmdp.policies.policy import as_policy
 
@@ -214,7 +215,10 @@ def baseline_policy(problem: Problem, choice: BaselineConfig) -> Policy:
         world = modelled(problem, f"baseline={choice.name}")
         if choice.whole_episodes and world.max_steps is not None:
             world = world.but(max_steps=None)
-        return run_solver(world, choice).policy
+        solution = run_solver(world, choice)
+        if solution.interrupted:
+            raise KeyboardInterrupt
+        return solution.policy
     made = make(choice, problem)
     return made.policy if isinstance(made, Solution) else as_policy(problem, made)
 
