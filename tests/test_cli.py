@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import runpy
@@ -345,6 +346,23 @@ def test_ctrl_c_in_the_search_for_a_baseline_writes_nothing(
     words = [*baselines, f"kernel={kernel}", "grid.size=3", "quiet=true"]
     assert main([command, *words, "hydra.run.dir=a"]) == 130
     assert capsys.readouterr() == ("", f"trackmdp {command}: interrupted\n")
+    assert not list(empty_folder.iterdir())
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="has no /dev/full")
+@pytest.mark.parametrize("words", ["solve grid.size=4", "train --help", "train --help all"])
+def test_a_full_disk_under_standard_output_is_one_line(words: str, empty_folder: Path) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "trackmdp.app.cli", *words.split()],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=ENVIRONMENT,
+            check=False,
+        )
+    line = f"trackmdp: standard output: {os.strerror(errno.ENOSPC)}\n"
+    assert (done.returncode, done.stderr) == (1, line)
     assert not list(empty_folder.iterdir())
 
 

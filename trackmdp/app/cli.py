@@ -48,8 +48,11 @@ def main(argv: list[str] | None = None) -> int:
         sys.stdout.flush()
         return status
     # The interpreter flushes stdout once more when it ends, and would complain again; so it is pointed at /dev/null.
-    except BrokenPipeError:  # `trackmdp train --help | head`: nobody listens any more
+    except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # `trackmdp train --help | head`: nobody listens any more.
+        if not isinstance(error, BrokenPipeError):
+            sys.stderr.write(f"trackmdp: standard output: {error.strerror}\n")
         return FAILED
 
 
@@ -73,10 +76,12 @@ def _dispatch(words: list[str]) -> int:
                 "Windows is not supported: expected Linux or macOS, or Linux in WSL on Windows"
             )
         return _run(command, words[1:])
-    except BrokenPipeError:
-        raise
     # Named one by one: SystemExit passes, with which argparse ends after `--version`.
     except (Exception, KeyboardInterrupt, Preempted) as error:
+        # Standard output has no file's name. If it has failed, it fails once more, which `main` reports.
+        if isinstance(error, OSError) and not error.filename:
+            sys.stdout.write("\n")
+            sys.stdout.flush()
         return _report(command, error)
 
 
