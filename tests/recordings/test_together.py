@@ -303,6 +303,39 @@ def test_a_wrong_number_of_targets_is_refused(count: Any) -> None:
         Group.of_tracks(setting, count)
 
 
+def test_more_targets_than_tracks_are_refused_before_training(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of 30 tracks 6 are held out, 3 to choose by, and 21 to learn from."""
+    file = write(tmp_path / "a.csv", APART30)
+    folder = tmp_path / "run"
+    words = ["kernel=tracks", f"kernel.path={file}", "grid.size=3", f"hydra.run.dir={folder}"]
+    for more, most in (
+        (["targets.count=7"], "6, the number of tracks held out (kernel.held_out)"),
+        (
+            ["targets.count=4", "algo=a2c"],
+            "3, the number of tracks to choose by (kernel.validation)",
+        ),
+        (
+            ["targets.count=4", "algo=a2c", "kernel.held_out=0.8"],
+            "3, the number of tracks to learn from",
+        ),
+    ):
+        assert main(["train", *words, *more]) == 2
+        assert capsys.readouterr().err == f"trackmdp train: {more[0]}: expected at most {most}\n"
+        assert not folder.exists()
+    with pytest.raises(UserError, match=r"targets\.count=7: expected at most 6, .* held out"):
+        tm.load_tracks(file, 3, targets=7)
+    assert len(tm.load_tracks(file, 3, targets=6)) == 6
+    assert main(["evaluate", *words, "baseline=none", "targets.count=7"]) == 2
+
+
+def test_95_percent_are_named_where_an_interval_is_shown() -> None:
+    few, many = (evaluate(group(by_hand(*[[0, 1, 2], [1, 2]] * k)), "none") for k in (1, 8))
+    assert few.about == "1 groups of held-out tracks"
+    assert many.about == "8 groups of held-out tracks, 95 %"
+
+
 def test_a_world_has_no_tracks_to_be_followed_together() -> None:
     with pytest.raises(UserError, match="a World, expected Recorded"):
         Group.of_tracks(tm.make_world(size=3), 2)  # type: ignore[arg-type]

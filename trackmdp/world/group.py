@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, TypeAlias
@@ -15,7 +15,7 @@ from trackmdp.arrays.types import Array, Indices
 from trackmdp.config.several import MOST_TARGETS
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, grid_words
-from trackmdp.recordings.tracks import Recorded
+from trackmdp.recordings.tracks import Recorded, Tracks
 from trackmdp.sensing.task import Task
 from trackmdp.world.model import World
 from trackmdp.world.problem import Problem, modelled
@@ -63,11 +63,13 @@ class Group(Carded):
         Tracks whose times overlap are followed together; where the recording has no times, any are (`together`).
 
         Raises:
-            UserError: `recorded` has no tracks, or `count` is no number of targets; or as of `Group`.
+            UserError: `recorded` has no tracks, or `count` is no number of targets or above that of the tracks held
+                out; or as of `Group`.
         """
         if not hasattr(recorded, "tracks"):
             raise UserError(f"Group.of_tracks: a {type(recorded).__name__}, expected Recorded")
         count = whole_number("Group.of_tracks: count", count, 1, MOST_TARGETS)
+        _check_tracks(count, {"held out (kernel.held_out)": recorded.held_out})
         kernel = recorded.tracks.kernel(recorded.num_cells)
         return cls([World.of(recorded, kernel)] * count, recorded)
 
@@ -210,10 +212,19 @@ def learned_in(subject: Subject, count: int, *, joint: bool) -> Subject:
     """Where a learner learns a policy for `count` targets: with all of them, or with a single one.
 
     Raises:
-        UserError: a single one, of targets that do not move alike.
+        UserError: a single one, of targets that do not move alike; or a part of recorded tracks has fewer than `count`.
     """
-    if joint and count > 1:
-        return group_of(subject, count)
+    if count > 1:
+        # Where a single one's plan is learned the figures at the end are of all as well.
+        group = group_of(subject, count)
+        if joint and (own := group.recorded) is not None:
+            parts = {
+                "to learn from": own.tracks,
+                "to choose by (kernel.validation)": own.validation,
+            }
+            _check_tracks(count, parts)
+        if joint:
+            return group
     if not isinstance(subject, Group):
         return subject
     if len(subject.kinds) > 1:
@@ -233,6 +244,23 @@ def _of_one_target(world: World) -> str | None:
         f"task.memory={world.memory}": world.memory != "cell",
     }
     return next((name for name, there in parts.items() if there), None)
+
+
+def _check_tracks(count: int, parts: Mapping[str, Tracks]) -> None:
+    """Check that `count` tracks can be followed at once; fewer may still overlap in time.
+
+    Args:
+        count: K.
+        parts: of the recording, by their names in messages.
+
+    Raises:
+        UserError: a part has fewer tracks.
+    """
+    for name, part in parts.items():
+        if len(part) < count:
+            raise UserError(
+                f"targets.count={count}: expected at most {len(part)}, the number of tracks {name}"
+            )
 
 
 def _alike(one: World, other: World) -> bool:

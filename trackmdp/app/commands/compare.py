@@ -39,7 +39,8 @@ def run(cfg: CompareConfig, folder: Path, problem: Subject) -> float:
     policies |= {name: name for name in cfg.baselines or []}
     compared = compare(problem, policies)
     write_json(folder / "comparison.json", _report(compared))
-    about = compared.about + (", 95 %" if compared.tracks is not None else "")
+    shown = any(each.difference.low is not None for each in compared.policies[1:])
+    about = compared.about + (", 95 %" if compared.tracks is not None and shown else "")
     heads = ["policy", "AIHTR", "accuracy", "sensors per step", "AIHTR less the first"]
     rows = [[each.name, *compared.cells(each)] for each in compared.policies]
     console.print(table(about, heads, rows))

@@ -92,11 +92,12 @@ class GroupEvaluation(Carded):
 
     @property
     def about(self) -> str:
-        """What the figures are means over."""
+        """What the figures are means over, and whether they have intervals."""
         if self.exact:
             return "exact"
         kind = "simulated episodes" if self.controls else "groups of held-out tracks"
-        return f"{len(self.totals):,} {kind}, 95 %"
+        interval = "" if self.aihtr.low is None else ", 95 %"
+        return f"{len(self.totals):,} {kind}{interval}"
 
     def card(self) -> Card:
         """The figures with their intervals."""
