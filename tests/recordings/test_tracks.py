@@ -46,6 +46,20 @@ def test_lines_of_several_tracks_may_be_mixed(tmp_path: Path) -> None:
     assert read_tracks(file, 3, exits=True).cells.tolist() == [0, 1, 3, 4, 5]
 
 
+def test_ids_may_be_texts(tmp_path: Path) -> None:
+    """Numbered in their sorted order, as of positions; numbers stay as they are."""
+    file = tmp_path / "t.csv"
+    file.write_text('"track",cell\nv1,3\n"u,0",0\nv1,4\n"u,0", 1\n 7 ,8\n')
+    np.savez(
+        tmp_path / "t.npz", track=["v1", "u,0", "v1", "u,0", "7"], cell=np.array([3, 0, 4, 1, 8])
+    )
+    for path in (file, tmp_path / "t.npz"):
+        tracks = read_tracks(path, 3, exits=True)
+        assert tracks.names.tolist() == [0, 1, 2]
+        assert tracks.cells.tolist() == [8, 0, 1, 3, 4]
+        assert tracks.first.tolist() == [0, 1, 3, 5]
+
+
 def test_a_file_that_has_changed_is_read_again(tmp_path: Path) -> None:
     file = tmp_path / "t.csv"
     for cell in (1, 2):
@@ -78,6 +92,9 @@ def test_a_file_that_has_changed_is_read_again(tmp_path: Path) -> None:
             "not a table of numbers (two columns of one name in track,cell,cell)",
         ),
         ("track,cell\n0,one\n", "not a table of numbers"),
+        ("track,cell\nv0,1\nv0,one\n", "not a table of numbers (could not convert string 'one'"),
+        ("track,cell\nv0,1\n,1\n", "not a table of numbers (could not convert string ''"),
+        ("track,cell\nv0,1\nv1,9\n", "cell of entry 2 is 9, expected 0 to 8"),
         ("track,cell\n0,1\n0\n", "not a table of numbers"),
         (
             "track,cell\n0,1,2\n",

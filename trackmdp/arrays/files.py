@@ -131,8 +131,13 @@ def whole_csr(data: Any, indices: Any, indptr: Any, shape: tuple[int, int]) -> s
     return matrix
 
 
-def read_columns(key: str, path: str | Path) -> dict[str, Array]:
+def read_columns(key: str, path: str | Path, *, ids: str) -> dict[str, Array]:
     """The columns of a .csv file under the names in its first line, or the arrays of an .npz.
+
+    Args:
+        key: the option, for messages.
+        path: the file.
+        ids: a column that may hold texts, which are numbered 0, 1 ... in sorted order.
 
     Raises:
         UserError: there is no such file, or it does not hold columns of real numbers, all of one length.
@@ -141,7 +146,9 @@ def read_columns(key: str, path: str | Path) -> dict[str, Array]:
     if suffix not in (".csv", ".npz"):
         raise UserError(f"{source}: expected a .csv or .npz file")
     with _opened(source, Path(path)) as stream:
-        columns = _csv_columns(stream) if suffix == ".csv" else load_npz(stream)
+        columns = _csv_columns(stream, ids) if suffix == ".csv" else load_npz(stream)
+    if ids in columns and columns[ids].dtype.kind == "U" and columns[ids].ndim == 1:
+        columns[ids] = np.unique(columns[ids], return_inverse=True)[1]
     for name, column in columns.items():
         if column.dtype.kind not in "iuf" or column.ndim != 1:
             raise UserError(
@@ -200,21 +207,44 @@ def _opened(source: str, file: Path) -> Iterator[BinaryIO]:
         yield stream
 
 
-def _csv_columns(stream: BinaryIO) -> dict[str, np.ndarray]:
+def _csv_columns(stream: BinaryIO, ids: str) -> dict[str, np.ndarray]:
+    """See `read_columns`."""
     names = first_line(stream)
     if len(set(names)) < len(names):
         raise ValueError(f"two columns of one name in {','.join(names)[:80]}")
     if not stream.read(1):
         return {name: np.zeros(0) for name in names}
     stream.seek(-1, os.SEEK_CUR)
-    table = _csv(stream, comments=None)
+    here = stream.tell()
+    try:
+        table = _csv(stream, comments=None)
+    except ValueError:
+        if ids not in names:
+            raise
+        stream.seek(here)
+        table = _csv_of_texts(stream, names.index(ids))
     if table.shape[1] != len(names):
         raise ValueError(f"{len(names)} names in the first line, but {table.shape[1]} columns")
     return dict(zip(names, table.T, strict=True))
 
 
-def _csv(stream: BinaryIO, comments: str | None = "#") -> Array:
-    """The numbers of the lines that are left."""
+def _csv_of_texts(stream: BinaryIO, column: int) -> Array:
+    """The lines that are left, the texts of one column as their places in sorted order."""
+    found: dict[str, int] = {}
+
+    def number(text: str) -> int:
+        if not (own := text.strip()):
+            raise ValueError("an empty id")
+        return found.setdefault(own, len(found))
+
+    table = _csv(stream, comments=None, quotechar='"', converters={column: number})
+    place = np.unique(list(found), return_inverse=True)[1]
+    table[:, column] = place[table[:, column].astype(np.int64)]
+    return table
+
+
+def _csv(stream: BinaryIO, comments: str | None = "#", **how: Any) -> Array:
+    """The numbers of the lines that are left; `how` as of `numpy.loadtxt`."""
     here = stream.tell()
     if b"\0" in stream.read(
         _LONGEST_HEAD
@@ -222,8 +252,10 @@ def _csv(stream: BinaryIO, comments: str | None = "#") -> Array:
         raise ValueError("not text")
     stream.seek(here)
     text = io.TextIOWrapper(stream, encoding="utf-8-sig")
-    table: Array = np.loadtxt(text, delimiter=",", ndmin=2, comments=comments)
-    text.detach()  # else it would close the stream
+    try:
+        table: Array = np.loadtxt(text, delimiter=",", ndmin=2, comments=comments, **how)
+    finally:
+        text.detach()  # else it would close the stream
     return table
 
 

@@ -214,8 +214,9 @@ class Recorded(Task):
 def read_tracks(path: str | Path, size: Size, *, exits: bool) -> Tracks:
     """Read tracks from a .csv file with a header line, or from arrays of the same names in an .npz file.
 
-    The columns are `track` (an integer, the same for all steps of a track), `cell` (or `row` and `column`), and if
-    wanted `step`. Without `step` a track's cells are in the order of the file.
+    The columns are `track` (an integer or a text, the same for all steps of a track; texts are numbered in sorted
+    order), `cell` (or `row` and `column`), and if wanted `step`. Without `step` a track's cells are in the order of the
+    file.
 
     Args:
         path: the file.
@@ -230,7 +231,7 @@ def read_tracks(path: str | Path, size: Size, *, exits: bool) -> Tracks:
 
 def _read(path: str | Path, size: tuple[int, int], exits: bool) -> Tracks:
     """See `read_tracks`."""
-    source, columns = f"kernel.path={path}", read_columns("kernel.path", path)
+    source, columns = f"kernel.path={path}", read_columns("kernel.path", path, ids="track")
     if set(columns) - {"step"} not in _COLUMNS:
         raise UserError(f"{source}: columns {', '.join(columns)}, expected {_FORMAT}")
     if not len(columns["track"]):
