@@ -165,10 +165,14 @@ DAMAGED = {
     "half": ("points", "id,t,x,lon\n", "expected either x, y or lat, lon"),
     "word": (
         "points",
-        "id,t,x,y\n1,1,east,2\n",
-        "not a table of positions (Unable to parse string",
+        "id,t,easting,y\n1,1,1,2\n1,2,,2\n1,3,abc,2\n",
+        "not a table of positions (easting of entry 3 is 'abc', expected a number)",
     ),
-    "time": ("points", "id,t,x,y\n1,yesterday,1,2\n", "not a table of positions ("),
+    "time": (
+        "points",
+        "id,t,x,y\n1,3,1,2\n1,yesterday,1,2\n",
+        "not a table of positions (t of entry 2 is 'yesterday', expected seconds or a time)",
+    ),
     "ragged": ("points", "id,t,x,y\n1,2,3,4\n1,2,3,4,5,6\n", "not a table of positions ("),
     "binary": ("points", b"\x00\xff\xfe" * 50, "not a table of positions ("),
     "parquet cut": ("points", b"PAR1" + bytes(50), "not a table of positions ("),
@@ -181,7 +185,12 @@ DAMAGED = {
     "nowhere": (
         "points",
         "id,t,x,y\n1,,1,1\n,1,1,1\n1,1,inf,1\n",
-        "no positions, expected a table of positions (3 reports",
+        "(3 reports read; 3 reports without a time or a position)",
+    ),
+    "swapped": (
+        "points",
+        "id,t,lat,lon\n1,0,147,-33\n1,1,147.1,-33\n",
+        "(2 reports read; 2 reports without a time or a position; expected lat -90 to 90 and lon",
     ),
     "json cut": ("geojson", '{"type": "FeatureCollection", "features": [', "not GeoJSON"),
     "json other": ("geojson", "[1, 2]", "not GeoJSON with the times of its points ("),

@@ -95,7 +95,7 @@ def table_of(
     import pandas as pd
 
     frame = pd.DataFrame(
-        {"id": ids, "time": _seconds(pd.Series(times)), "x": _number(x), "y": _number(y)}
+        {"id": ids, "time": _seconds(pd.Series(times)), "x": _number(x, "x"), "y": _number(y, "y")}
     )
     frame["piece"] = piece
     # inf is no position either; AIS gives 91 and 181 degrees where the receiver of a ship knows none.
@@ -121,10 +121,32 @@ def table_of(
     return Positions(**columns, **are, dropped={**(dropped or {}), **counts})
 
 
-def _number(column: Any) -> Any:
+def _number(column: Any, name: str) -> Any:
+    """The numbers of a column, which `name` names where it has no name of its own.
+
+    Raises:
+        ValueError: one is no number.
+    """
     import pandas as pd
 
-    return pd.to_numeric(pd.Series(column), errors="raise").astype(np.float64)
+    series = pd.Series(column)
+    try:
+        return pd.to_numeric(series, errors="raise").astype(np.float64)
+    except (TypeError, ValueError):
+        _refuse_entry(series, pd.to_numeric(series, errors="coerce"), name, "a number")
+        raise
+
+
+def _refuse_entry(column: Any, parsed: Any, name: str, expected: str) -> None:
+    """Refuse the first entry of a column that has none among the `parsed` ones, if there is one.
+
+    Raises:
+        ValueError: there is; the message names the column and the entry.
+    """
+    wrong = np.flatnonzero(parsed.isna() & column.notna())
+    if len(wrong):
+        found = f"{column.name or name} of entry {wrong[0] + 1} is {column.iloc[wrong[0]]!r}"
+        raise ValueError(f"{found}, expected {expected}") from None
 
 
 def _seconds(column: Any) -> Any:
@@ -136,12 +158,18 @@ def _seconds(column: Any) -> Any:
     import pandas as pd
 
     if pd.api.types.is_numeric_dtype(column) or column.isna().all():
-        return _number(column)
+        return _number(column, "time")
     first = str(column.dropna().iloc[0])
     # ISO 8601, as nearly all have it, or 31/12/2024 23:59:59 as the Danish AIS has it. Other orders of day and month
     # are not guessed.
     form = "%d/%m/%Y %H:%M:%S" if first[2:3] == "/" else "ISO8601"
-    stamps = pd.to_datetime(column, utc=True, format=form)
+    try:
+        stamps = pd.to_datetime(column, utc=True, format=form)
+    except (TypeError, ValueError):
+        dated = pd.to_datetime(column, utc=True, format=form, errors="coerce")
+        seconds = pd.to_numeric(column, errors="coerce")
+        _refuse_entry(column, seconds.where(dated.isna(), 0.0), "time", "seconds or a time")
+        raise
     return (stamps - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
 
 

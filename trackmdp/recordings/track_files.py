@@ -75,9 +75,22 @@ def read_positions(path: str | Path, kind: str, columns: Sequence[str] = ()) -> 
         decoded(source, words),
     ):
         found = reader(stream, columns) if columns else reader(stream)
-    if not len(found.time):
-        raise UserError(f"{source}: no positions, expected {words} ({found.read} reports read)")
-    return found
+    return _some(found, source, words)
+
+
+def _some(found: Positions, source: str, words: str) -> Positions:
+    """Positions, if there are any.
+
+    Raises:
+        UserError: there are none; the message says why reports were left out.
+    """
+    if len(found.time):
+        return found
+    left = [f"{count} {why}" for why, count in found.dropped.items() if count]
+    if left and found.geographic:
+        left.append("expected lat -90 to 90 and lon -180 to 180")
+    counts = "; ".join([f"{found.read} reports read", *left])
+    raise UserError(f"{source}: no positions, expected {words} ({counts})")
 
 
 def read_track_file(
@@ -134,7 +147,7 @@ def read_track_file(
     )
     if in_memory:
         with decoded(source, "a table of positions"):
-            positions = frame_positions(path, columns)
+            positions = _some(frame_positions(path, columns), source, "a table of positions")
         return _on_grid(positions, made, source, draw)
     return once(_read_on_grid, path, format or kind, made, columns, draw)
 
