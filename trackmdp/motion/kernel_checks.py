@@ -77,7 +77,8 @@ def check_kernel(
     if not truncates and not (leaves := _can_exit(kernel, sums)).all():
         cell = int(np.flatnonzero(~leaves)[0]) // modes
         raise UserError(
-            f"{source}: from cell {cell} the target never exits, so no episode ends; set grid.max_steps"
+            f"{source}: from cell {cell} the target never exits, so no episode ends; expected a way out of every cell, "
+            "or grid.max_steps where policies are learned or simulated (only whole episodes are solved)"
         )
 
 
