@@ -86,6 +86,8 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
             "train kernel.exit_probability=0",
             "kernel=random_support: from cell 0 the target never exits",
         ),
+        # The size, and not the frames that follow from it.
+        ("train grid.size=1000000 quiet=true", "grid.size=1000000: needs about"),
         ("train cost.sensor=no.csv", "cost.sensor="),
         ("train algo={name:ppo}", "algo={'name': 'ppo'}: expected one of "),
         ("train algo=a2c credit=per_sensor", "credit: renamed, expected algo=a2c_per_sensor"),

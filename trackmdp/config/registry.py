@@ -29,6 +29,7 @@ from typing import Any
 from omegaconf import AnyNode, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException, UnsupportedValueType
 
+from trackmdp.config.learning import MOST_FRAMES
 from trackmdp.config.options import GROUPS, ChoiceConfig, options
 from trackmdp.errors import UserError, message_of
 
@@ -194,6 +195,7 @@ def _per_cell(count: float, size: Any, least: int = 0) -> int:
     if not all(isinstance(side, int) for side in sides):
         return max(math.ceil(count), least)  # the check of the size itself follows
     if isinstance(count, int):
-        return max(count * math.prod(sides), least)
+        # Of a grid too large for the memory the size is refused, not an option that follows from it.
+        return min(max(count * math.prod(sides), least), MOST_FRAMES)
     # Rounded before it is rounded up: .2 · M / 1000 and M / 5000 have to agree to the last bit.
     return max(math.ceil(round(count * math.prod(sides) / least, 9)), 1) * least
