@@ -224,3 +224,18 @@ def test_all_kernels_are_listed() -> None:
 def test_an_argument_of_another_name_is_refused_with_the_right_one() -> None:
     with pytest.raises(UserError, match="grid_size: unknown argument, did you mean size"):
         make_world(grid_size=5)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"p_d": 0.9}, "p_d: unknown argument, expected detection"),
+        ({"p_s": 0.9}, "p_s: unknown argument, expected safe_detection"),
+        ({"sensor": "miss"}, "sensor: unknown argument, expected detection and safe_detection"),
+    ],
+)
+def test_a_sensor_as_of_the_command_line_is_refused_with_the_arguments_for_it(
+    options: dict[str, Any], expected: str
+) -> None:
+    with pytest.raises(UserError, match=f"^{expected}$"):
+        make_world(**options)

@@ -44,6 +44,13 @@ OF_TASK = {
 }
 """Arguments of `make_world` and `load_tracks` -> options of the command line."""
 
+_OF_SENSORS = {
+    "p_d": "detection",
+    "p_s": "safe_detection",
+    "sensor": "detection and safe_detection",
+}
+"""Names of the command line -> arguments of `make_world` and `load_tracks`."""
+
 _OF_PLACE = {name: f"grid.{name}" for name in ("cell", "origin", "crs")}
 
 
@@ -301,7 +308,7 @@ def _words(arguments: dict[str, Any]) -> dict[str, Any]:
     """The arguments of `make_world` or `load_tracks`, and the options of a kernel among them, by command-line names.
 
     Raises:
-        UserError: an option of no kernel resembles an argument.
+        UserError: an option of no kernel resembles an argument, or is one of the command line's sensors.
     """
     size, known = arguments["size"], OF_TASK | _OF_PLACE
     missing = (_flat(p, arguments.pop(p, 1.0), size) for p in ("detection", "safe_detection"))
@@ -310,6 +317,8 @@ def _words(arguments: dict[str, Any]) -> dict[str, Any]:
     }
     of_kernels = {name for schema in GROUPS["kernel"].values() for name in options(schema)}
     for name in arguments.keys() - of_kernels:
+        if name in _OF_SENSORS:
+            raise UserError(f"{name}: unknown argument, expected {_OF_SENSORS[name]}")
         if close := difflib.get_close_matches(name, OF_TASK, n=1):
             raise UserError(f"{name}: unknown argument, did you mean {close[0]}?")
     return given(of_task | {f"kernel.{name}": value for name, value in arguments.items()})
