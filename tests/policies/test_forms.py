@@ -170,6 +170,14 @@ def test_a_model_of_stable_baselines_is_its_mode() -> None:
             lambda: tm.evaluate(WORLD, torch.nn.Linear(3, 4)),
             "policy: Linear: expected a function of last_c",
         ),
+        (
+            lambda: tm.evaluate(WORLD, lambda x, n, h: None),
+            "its action: expected 0 or 1 .* NoneType",
+        ),
+        (
+            lambda: tm.Policy.from_function(lambda x, n, h: h, WORLD),
+            "policy: the first argument is a function, expected a world",
+        ),
         (lambda: tm.train(WORLD, log=["tensorboard"]), "log=.*tensorboard.*: expected folder"),
     ],
 )

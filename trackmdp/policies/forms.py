@@ -72,7 +72,16 @@ def state_keys(task: Task, targets: Sequence[int] = ()) -> list[str]:
 
 
 def known_task(task: Task, policy: object) -> Task:
-    """The task as `policy` sees it: a module that does not read `key`, and any function, sees the cell alone."""
+    """The task as `policy` sees it: a module that does not read `key`, and any function, sees the cell alone.
+
+    Raises:
+        UserError: it is no task.
+    """
+    if not hasattr(task, "remembering"):
+        kind = type(task).__name__
+        raise UserError(
+            f"policy: the first argument is a {kind}, expected a world or recorded tracks"
+        )
     return task if "key" in getattr(policy, "in_keys", ()) else task.remembering()
 
 
@@ -130,8 +139,14 @@ def function_rule(task: Task, function: Callable[..., Any]) -> Rule:
         pass
 
     def rule(last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor) -> Tensor:
-        action = torch.as_tensor(function(last_cell, steps_since_detection, action_history))
+        found = function(last_cell, steps_since_detection, action_history)
         shape = len(last_cell), task.num_sensors
+        try:
+            action = torch.as_tensor(found)
+        except (RuntimeError, TypeError, ValueError):
+            kind = type(found).__name__
+            expected = f"0 or 1 for each sensor, {list(shape)}"
+            raise UserError(f"policy: its action: expected {expected}, got {kind}") from None
         return checked_action(action, shape, "policy: its action", task.budget)
 
     return rule

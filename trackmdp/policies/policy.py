@@ -132,12 +132,11 @@ class Policy(TensorDictModuleBase, PolicyTable):
             check: ask everything twice, to find out whether it draws.
 
         Raises:
-            UserError: it draws, or it returns something else.
+            UserError: it draws, or it returns something else; or `task` is none.
         """
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            return cls._unrolled(
-                task.remembering(), function_rule(task, function), "cpu", check=check
-            )
+            known = known_task(task, None)
+            return cls._unrolled(known, function_rule(task, function), "cpu", check=check)
 
     @classmethod
     def from_module(
