@@ -79,7 +79,7 @@ def test_a_memory_is_shown_as_at_the_start() -> None:
 @pytest.mark.parametrize(
     ("place", "message"),
     [
-        ({}, "no latitude and longitude"),
+        ({}, "no latitude and longitude, expected a policy that was trained or solved with"),
         ({"cell": 5.0, "origin": (0.0, 0.0)}, "no latitude and longitude"),
     ],
 )

@@ -55,8 +55,8 @@ def checked_place(policy: PolicyTable) -> Place:
     place, cells = policy.task.place, policy.task.num_cells
     if place is None or place.crs is None:
         raise UserError(
-            "geojson: the grid has no latitude and longitude, expected positions as lat, lon, or grid.cell, "
-            "grid.origin and grid.crs"
+            "geojson: the grid has no latitude and longitude, expected a policy that was trained or solved with "
+            "positions as lat, lon, or with grid.cell, grid.origin and grid.crs"
         )
     if not policy.deterministic:
         raise UserError("geojson: the policy draws its sets, expected a deterministic one")
