@@ -100,6 +100,8 @@ def reason(error: BaseException) -> str:
         if error.errno == errno.ELOOP:
             return "a symbolic link, expected an ordinary file"
         return "no such file" if error.errno == errno.ENOENT else os.strerror(error.errno).lower()
+    if isinstance(error, KeyError):
+        return printable(f"no {error}")[:200]
     line = printable(" ".join(str(error).split()))
     return line[:200] or type(error).__name__
 

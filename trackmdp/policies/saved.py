@@ -6,6 +6,7 @@ enough to be worth writing out: a million cells would be 260 MB.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -154,6 +155,8 @@ def _listed(task: Task, content: dict[str, Any]) -> PolicyTable:
     if content["size"] != list(task.size):  # as many cells in other rows would fit
         raise ValueError(f"size {content['size']}, rows and columns; expected {list(task.size)}")
     keys, count = content["sets"], task.num_keys
+    if not isinstance(keys, dict):
+        raise ValueError(f"sets: expected {count} plans by their keys")
     # Counted first: the memory in a stranger's file may make any number of keys.
     if (
         content["t_max"] != task.t_max
@@ -163,7 +166,28 @@ def _listed(task: Task, content: dict[str, Any]) -> PolicyTable:
         raise ValueError(
             f"{len(keys)} plans, t_max {content['t_max']}; expected {count}, {task.t_max}"
         )
-    rows = [each for key in range(count) for each in keys[str(key)]]
+    rows = [each for key in range(count) for each in _plan(task, key, keys[str(key)])]
     pointer = np.cumsum([0, *map(len, rows)])
     indices = np.array([each for row in rows for each in row], dtype=np.int64)
     return unpacked_policy(task, {"indices": indices, "indptr": pointer})
+
+
+def _plan(task: Task, key: int, sets: Any) -> list[list[int]]:
+    """The sets of one plan, for n = 0 ... t_max misses.
+
+    Raises:
+        ValueError: they are not that.
+    """
+    if (
+        not isinstance(sets, list)
+        or len(sets) != task.num_choices
+        or not all(isinstance(on, list) for on in sets)
+    ):
+        raise ValueError(f"plan {key}: expected {task.num_choices} lists of sensors")
+    for sensor in itertools.chain(*sets):
+        # numpy would cut 1.5 to 1, and take true for it.
+        if type(sensor) is not int or not 0 <= sensor < task.total_sensors:
+            raise ValueError(
+                f"plan {key}: sensor {sensor!r}, expected a whole number from 0 to {task.total_sensors - 1}"
+            )
+    return sets
