@@ -47,8 +47,12 @@ def whole_file(file: Path) -> Iterator[BufferedRandom]:
             # file under the final name.
             sync(stream, part)
             part.replace(file)
-        except BaseException:  # Ctrl-C included
+        except BaseException as error:  # Ctrl-C included
             part.unlink(missing_ok=True)
+            if (
+                isinstance(error, OSError) and error.filename is None
+            ):  # a full disk, which names no file
+                error.filename = str(file)
             raise
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -16,6 +17,7 @@ import pytest
 
 from tests.solvers.worlds import paper_world
 from tests.typed import ENVIRONMENT
+from trackmdp import durable
 from trackmdp.app.cli import main
 from trackmdp.policies import saved
 from trackmdp.solvers import bounds
@@ -228,3 +230,17 @@ def test_a_grid_that_cannot_fit_into_memory_is_refused_in_one_line(
     (line,) = capsys.readouterr().err.splitlines()
     assert "grid.size=1000000000: needs about" in line
     assert not list(empty_folder.iterdir())
+
+
+def test_a_full_disk_under_the_results_is_one_line_that_names_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(durable, "sync", full)
+    assert main(["solve", "grid.size=3", "quiet=true", f"hydra.run.dir={tmp_path}/a"]) == 1
+    line = capsys.readouterr().err
+    assert line.startswith(f"trackmdp solve: {tmp_path}/a/")
+    assert line.endswith(f": {os.strerror(errno.ENOSPC)}\n")
+    assert line.count("\n") == 1
