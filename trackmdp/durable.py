@@ -39,7 +39,7 @@ def whole_file(file: Path) -> Iterator[BufferedRandom]:
     """
     part = _part(file)
     if not file.parent.is_dir():  # else the message would name the hidden file
-        raise FileNotFoundError(errno.ENOENT, "no such folder", str(file.parent))
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(file.parent))
     with create(part) as stream:
         try:
             yield stream
