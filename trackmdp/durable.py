@@ -49,9 +49,8 @@ def whole_file(file: Path) -> Iterator[BufferedRandom]:
             part.replace(file)
         except BaseException as error:  # Ctrl-C included
             part.unlink(missing_ok=True)
-            if (
-                isinstance(error, OSError) and error.filename is None
-            ):  # a full disk, which names no file
+            # A full disk names no file.
+            if isinstance(error, OSError) and error.errno and error.filename is None:
                 error.filename = str(file)
             raise
 

@@ -106,7 +106,7 @@ def test_what_cannot_be_exported_is_one_line(world: tm.World, tmp_path: Path) ->
         map_features(tm.Policy.random_k(world, 2))
     with pytest.raises(UserError, match=r"a\.pkl, expected a file that ends with \.onnx, \.pt2"):
         tm.export(tm.Policy.none(world), tmp_path / "a.pkl")
-    with pytest.raises(UserError, match="a World, expected a Policy"):
+    with pytest.raises(UserError, match="a World, expected a policy of one target"):
         tm.export(world, tmp_path / "a.onnx")
 
 
