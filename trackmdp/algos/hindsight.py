@@ -65,7 +65,7 @@ def budget(task: Task, cfg: PerSensorConfig) -> tuple[int, int]:
     few = task.num_keys * task.num_choices <= 300
     hidden = 128 if few else 256
     if task.order > 1:  # few such keys occur, and more ended no better, in twice the time
-        few, hidden = True, 64
+        hidden = 64
     if task.num_keys > _MOST_CELLS_OF_NETS:
         hidden = 0
     # With a memory, plans on whole paths, which begin from the nets' policies, end no better after more updates.

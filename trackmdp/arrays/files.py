@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 import os
 import warnings
 from collections.abc import Callable, Hashable, Iterator, Mapping
@@ -54,14 +53,13 @@ def per_cell(
     Raises:
         UserError: a list or file is missing or malformed, holds another number of numbers, or one out of range.
     """
-    count, each = (math.prod(grid_size(size)), "cell") if sensors is None else (sensors, "sensor")
+    count, each = (grid_size(size), "cell") if sensors is None else (sensors, "sensor")
     if not isinstance(given, str):
         return one_each(key, given, count, each, allowed)
     values = read_numbers(key, given, name=key.rpartition(".")[2])
     # A row or a column of numbers in a .csv file is a list.
     values = values.ravel() if 1 in values.shape else values
-    grid = grid_size(size) if sensors is None else sensors
-    return one_each(f"{key}={given}", values, grid, each, allowed)
+    return one_each(f"{key}={given}", values, count, each, allowed)
 
 
 def read_numbers(key: str, path: str | Path, *, name: str) -> Array:

@@ -66,9 +66,14 @@ class EpisodeLog:
             if layout:
                 write_layout(folder / "episodes.layout.json", self._writer.run)
 
+    @property
+    def part(self) -> Path:
+        """Where the episodes are until the file is whole."""
+        return self.file.with_name(f"{self.file.name}.part")
+
     def _take_over(self, policies: int) -> None:
         """Resume the log of an earlier process, which was killed (`.part`) or ended in order."""
-        part = self.file.with_name(f"{self.file.name}.part")
+        part = self.part
         if not policies:  # killed before its first checkpoint: the run begins anew, and all of it is recorded again
             part.unlink(missing_ok=True)
             return
@@ -138,8 +143,7 @@ class EpisodeLog:
             yield
         # Any failure: hours of training are worth more than the log of them, and the line gives the reason.
         except Exception as error:
-            part = self.file.with_name(f"{self.file.name}.part")
-            self._tell(f"{part}: {reason(error)}; no more episodes are logged")
+            self._tell(f"{self.part}: {reason(error)}; no more episodes are logged")
             self.abandon()
 
 

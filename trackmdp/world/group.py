@@ -20,6 +20,8 @@ from trackmdp.sensing.task import Task
 from trackmdp.world.model import World
 from trackmdp.world.problem import Problem, modelled
 
+_HELD_OUT = "held out (kernel.held_out)"
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Group(Carded):
@@ -69,7 +71,7 @@ class Group(Carded):
         if not hasattr(recorded, "tracks"):
             raise UserError(f"Group.of_tracks: a {type(recorded).__name__}, expected Recorded")
         count = whole_number("Group.of_tracks: count", count, 1, MOST_TARGETS)
-        _check_tracks(count, {"held out (kernel.held_out)": recorded.held_out})
+        _check_tracks(count, {_HELD_OUT: recorded.held_out})
         kernel = recorded.tracks.kernel(recorded.num_cells)
         return cls([World.of(recorded, kernel)] * count, recorded)
 
@@ -214,17 +216,15 @@ def learned_in(subject: Subject, count: int, *, joint: bool) -> Subject:
     Raises:
         UserError: a single one, of targets that do not move alike; or a part of recorded tracks has fewer than `count`.
     """
-    if count > 1:
+    if count > 1 and (own := subject.recorded) is not None:
         # Where a single one's plan is learned the figures at the end are of all as well.
-        group = group_of(subject, count)
-        if joint and (own := group.recorded) is not None:
-            parts = {
-                "to learn from": own.tracks,
-                "to choose by (kernel.validation)": own.validation,
-            }
-            _check_tracks(count, parts)
+        parts = {_HELD_OUT: own.held_out}
         if joint:
-            return group
+            parts["to learn from"] = own.tracks
+            parts["to choose by (kernel.validation)"] = own.validation
+        _check_tracks(count, parts)
+    if joint and count > 1:
+        return group_of(subject, count)
     if not isinstance(subject, Group):
         return subject
     if len(subject.kinds) > 1:

@@ -183,8 +183,8 @@ def _log(
         whole = log.close()
     except KeyboardInterrupt:
         log.abandon()
-        part = f"{log.file}.part"
-        _tell(f"{part}: cut off; `trackmdp replay file={part} recover=true` saves its episodes")
+        line = f"trackmdp replay file={log.part} recover=true"
+        _tell(f"{log.part}: cut off; `{line}` saves its episodes")
         raise
     if whole:
         along = " along held-out tracks" if episodes.problem.recorded else ""
