@@ -24,7 +24,13 @@ from trackmdp.sensing.decisions import sensing
 from trackmdp.sensing.task import Task
 from trackmdp.solvers.linear import DIRECT_CELLS, TOLERANCE, RenewalSystem
 from trackmdp.solvers.plans import Layout, Plans, Turn
-from trackmdp.solvers.value import event_system, first_events, solved, whole_renewals
+from trackmdp.solvers.value import (
+    event_groups,
+    event_system,
+    first_events,
+    solved,
+    whole_renewals,
+)
 from trackmdp.solvers.walk import Events, Passed, Step, Walk, all_events, passed
 from trackmdp.world.model import World
 
@@ -85,8 +91,8 @@ class Renewal:
 
     @property
     def groups(self) -> tuple[int, int] | IndexArray:
-        """`size`, or `[B]` the cells of the events."""
-        return self.motion.cell[self.states] if self.size is None else self.size
+        """`size`, or `[B]` the groups of the events."""
+        return event_groups(self.motion, self.states) if self.size is None else self.size
 
     @property
     def world(self) -> World:
