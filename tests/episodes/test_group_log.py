@@ -265,9 +265,9 @@ def test_a_cut_log_gives_back_its_whole_episodes(log: Path, tmp_path: Path) -> N
 def test_targets_of_motions_that_are_not_there_are_damage(said: str, log: Path) -> None:
     with EpisodeReader(log) as reader:
         facts = reader.run.said | {"targets": said}
-    assert LoggedRun.of(Path("a.mcap"), facts | {"targets": "0 " * 1000}).kinds == (0,) * 1000
+    assert LoggedRun(Path("a.mcap"), facts | {"targets": "0 " * 1000}).kinds == (0,) * 1000
     with pytest.raises(UserError, match="not a log of trackmdp"):
-        LoggedRun.of(Path("a.mcap"), facts)
+        LoggedRun(Path("a.mcap"), facts)
 
 
 def test_steps_of_other_targets_are_damage(log: Path) -> None:

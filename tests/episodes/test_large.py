@@ -140,7 +140,7 @@ def test_a_small_grid_is_drawn_whole() -> None:
     world = make_world("random_walk", size=4)
     episode = Episode.__new__(Episode)
     for name, value in {
-        "belief": None,
+        "belief": np.zeros((1, 16), np.float32),
         "action": np.zeros((1, 16), bool),
         "target": np.array([5]),
         "start": 5,

@@ -156,9 +156,9 @@ def test_a_bad_episode_does_not_spoil_the_file(tmp_path: Path) -> None:
 def test_grid_messages_keep_to_the_rules_of_viewers(log: Path) -> None:
     """A field ends within its cell, a row within its stride, data are whole rows; no null, no array of arrays."""
     with EpisodeReader(log) as reader:
-        said = json.loads(
-            next(data for topic, _, data in reader._around(reader.rows[0]) if topic == "/grid")
-        )
+        ends = (int(reader.rows[0][name]) for name in ("start_time", "end_time"))
+        messages = reader._container.messages_around(*ends)
+        said = json.loads(next(data for topic, _, data in messages if topic == "/grid"))
     size = {1: 1, 7: 4}
     assert all(
         each["offset"] + size[each["type"]] <= said["cell_stride"] for each in said["fields"]

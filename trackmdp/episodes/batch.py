@@ -96,15 +96,13 @@ class Episodes(Showing[Episode]):
         seeds: Sequence[int],
         batches: Sequence[Columns],
     ) -> Episodes:
-        """The episodes of some batches, in their order; each has the columns, and the `length` of its episodes."""
-        none = np.zeros(0, dtype=np.int32)
-        # No episode: columns of length 0, of the types that they have otherwise.
-        empty: Columns = dict.fromkeys(("misses", "target", "sensors", "length"), none)
-        empty |= dict.fromkeys(("start", "start_mode"), none.astype(np.int64))
-        empty |= {"located": none > 0, "truncated": none > 0, "reward": none.astype(np.float32)}
+        """The episodes of some batches, in their order; each has the columns, and the `length` of its episodes.
+
+        At least one batch, which without `seeds` gives no more than the types of the columns.
+        """
         columns = {
-            name: np.concatenate([each[name] for each in batches or [empty]])
-            for name in (*batches, empty)[0]
+            name: np.concatenate([each[name] for each in batches])[: None if seeds else 0]
+            for name in batches[0]
         }
         # Lengths 2 1 3 begin at 0 2 3, and end at 6: episode i has the steps first[i] ... first[i + 1] - 1.
         first = np.concatenate([[0], np.cumsum(columns.pop("length"))])

@@ -12,7 +12,6 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack
 from io import BytesIO
-from itertools import takewhile
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -81,6 +80,7 @@ class Container:
                 summary.chunk_indexes, key=lambda chunk: chunk.message_start_time
             )
             self._ends = [chunk.message_end_time for chunk in self._chunks]
+            self._held: tuple[int, list[Said]] = (-1, [])
             opened.pop_all()  # from here on it stays open
 
     def _check_summary(self) -> None:
@@ -130,17 +130,18 @@ class Container:
             raise Damaged(f"{kind.__name__.lower()} {name}")
         return found
 
-    def chunks_between(self, begin: int, end: int) -> Iterator[ChunkIndex]:
-        """The chunks with messages from log time `begin` to `end`, in their order; logs are in order of time."""
-        later = self._chunks[bisect_left(self._ends, begin) :]
-        return takewhile(lambda chunk: chunk.message_start_time <= end, later)
-
-    def messages(self, chunk: ChunkIndex) -> list[Said]:
-        """All messages of a chunk."""
-        found = record_of(frame_at(self.stream, chunk.chunk_start_offset))
-        if not isinstance(found, Chunk):
-            raise Damaged("a chunk")
-        return messages_of(found, self._topics)
+    def messages_around(self, begin: int, end: int) -> Iterator[Said]:
+        """All messages of the chunks with some from log time `begin` to `end`; logs are in order of time."""
+        for chunk in self._chunks[bisect_left(self._ends, begin) :]:
+            if chunk.message_start_time > end:
+                return
+            # Short episodes share a chunk: read one after another, the chunk is unpacked once.
+            if self._held[0] != chunk.chunk_start_offset:
+                found = record_of(frame_at(self.stream, chunk.chunk_start_offset))
+                if not isinstance(found, Chunk):
+                    raise Damaged("a chunk")
+                self._held = chunk.chunk_start_offset, messages_of(found, self._topics)
+            yield from self._held[1]
 
 
 def frame_at(stream: BinaryIO, offset: int) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,7 @@ from trackmdp.notebook.card import Card, Carded, Facts, decimal
 from trackmdp.sensing.task import Task
 from trackmdp.sensing.windows import Window
 
-Floats: TypeAlias = npt.NDArray[np.float32]
+Floats = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -60,11 +60,6 @@ class Recording(Carded):
     def __len__(self) -> int:
         return len(self.target)
 
-    @cached_property
-    def observation(self) -> Indices:
-        """`[T]` the cell in which the target was located by the step, -1 if in none; of K targets `[T, K]`."""
-        return np.where(self.located, self.target, -1)
-
     @property
     def last_cell(self) -> Indices:
         """`[T]` cell of the last detection before the step, x_{l(k)}; of K targets `[T, K]`."""
@@ -87,17 +82,12 @@ class Recording(Carded):
         found[-1] &= not self.terminated  # the last step is the exit's
         return found
 
-    @property
-    def complete(self) -> bool:
-        """Whether beliefs, and of one target probabilities, were asked for."""
-        raise NotImplementedError
-
     def singles(self) -> Iterator[Episode]:
         """An episode for each target, with the sensors and the reward of all."""
         raise NotImplementedError
 
-    def expected(self, t: int, cells: int) -> npt.NDArray[np.floating[Any]]:
-        """`[M]` how many targets were expected in each cell at step `t`; 0 where beliefs were not asked for."""
+    def expected(self, t: int) -> AnyArray:
+        """`[M]` how many targets were expected in each cell at step `t`; beliefs were asked for."""
         raise NotImplementedError
 
     def to_tensordict(self, task: Task) -> TensorDict:
@@ -141,8 +131,7 @@ class Episode(Recording):
     """
 
     start: int
-    belief: Floats | None = None
-    probability: Floats | None = None
+    probability: Any = None
     start_mode: int = 0
 
     def card(self) -> Card:
@@ -151,18 +140,13 @@ class Episode(Recording):
         facts = {"steps": f"{len(self):,}; {end}", "start": f"cell {self.start}"}
         return self._card(facts, f"in {int(self.located.sum()):,} steps")
 
-    @property
-    def complete(self) -> bool:
-        """See `Recording`."""
-        return self.belief is not None and self.probability is not None
-
     def singles(self) -> Iterator[Episode]:
         """See `Recording`."""
         yield self
 
-    def expected(self, t: int, cells: int) -> npt.NDArray[np.floating[Any]]:
+    def expected(self, t: int) -> AnyArray:
         """See `Recording`."""
-        return np.zeros(cells) if self.belief is None else self.belief[t]
+        return self.belief[t]
 
     def to_tensordict(self, task: Task) -> TensorDict:
         """See `Recording`; with a window actions are in its local numbers, as the environment takes them."""

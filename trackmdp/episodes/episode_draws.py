@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from trackmdp.arrays.types import AnyArray, IndexArray
 from trackmdp.seeding import derive
 
-Columns: TypeAlias = dict[str, npt.NDArray[Any]]
+Columns = dict[str, AnyArray]
 
 _BLOCK = 256  # draws taken from an episode's generator at a time; part of the meaning of a seed, so never to be changed
 
@@ -61,7 +60,7 @@ def uniform(
     )
 
 
-def joined(taken: Sequence[Columns]) -> tuple[Columns, npt.NDArray[np.int64]]:
+def joined(taken: Sequence[Columns]) -> tuple[Columns, IndexArray]:
     """Columns of steps, taken together by the running episodes `row`, as one episode after another's; their lengths.
 
     Steps were taken in order of time; a stable sort by episode leaves them so within each. Example: the rows 0 1 2,

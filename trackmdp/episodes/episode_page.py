@@ -99,7 +99,6 @@ def _of_target(episode: Episode, task: Task) -> dict[str, Any]:
     """Where a target was, and where it was expected."""
     shown = slice(0, MOST_STEPS)
     target = np.where(episode.target == task.num_cells, -1, episode.target)
-    assert episode.belief is not None  # a logged episode has it
     return {
         "start": -1 if episode.start == task.num_cells else int(episode.start),
         "target": target[shown].tolist(),

@@ -10,8 +10,8 @@ from typing import Any
 
 from trackmdp.durable import write_text
 from trackmdp.episodes.episode_page import page
+from trackmdp.episodes.group_messages import form_of
 from trackmdp.episodes.reader import EpisodeReader
-from trackmdp.episodes.written import form_of
 
 
 def write_page(reader: EpisodeReader, file: Path, number: int | None = None) -> None:

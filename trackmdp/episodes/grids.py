@@ -9,7 +9,7 @@ import base64
 import json
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +30,7 @@ _EACH = 4 + 4 + 1
 _AT_ONCE = 2**22
 """Numbers of a layer that are made together, of several steps."""
 
-Box: TypeAlias = tuple[int, int, int, int]
+Box = tuple[int, int, int, int]
 """Top, bottom, left and right, ends excluded."""
 
 _CELL = np.dtype([("belief", "<f4"), ("policy", "<f4")])
@@ -86,15 +86,13 @@ def grid_messages(
         }
 
 
-_Layer: TypeAlias = tuple[AnyArray, Box]
+_Layer = tuple[AnyArray, Box]
 
 
 def _layers(
     episode: Episode, size: tuple[int, int], active: BoolArray
 ) -> Iterator[tuple[_Layer, _Layer]]:
     """Of each step belief and policy `[R, C]`, and the cells sensed, each with the box to be written."""
-    assert episode.belief is not None
-    assert episode.probability is not None
     # A few steps at a time: of all steps together they would take 12 bytes for each step and cell.
     each = max(1, _AT_ONCE // math.prod(size))
     for begin in range(0, len(episode), each):

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from scipy import sparse
 from tensordict import TensorDict
 
 from trackmdp.arrays.types import AnyArray, BoolArray, Indices
@@ -26,18 +23,12 @@ class GroupEpisode(Recording):
     """
 
     start: Indices
-    belief: sparse.csr_array | None = None
 
     def card(self) -> Card:
         """Length, return, detections and end."""
         end = "all targets exited" if self.terminated else "truncated"
         facts = {"targets": str(len(self.start)), "steps": f"{len(self):,}; {end}"}
         return self._card(facts, f"{int(self.located.sum()):,} times")
-
-    @property
-    def complete(self) -> bool:
-        """See `Recording`."""
-        return self.belief is not None
 
     def singles(self) -> Iterator[Episode]:
         """See `Recording`."""
@@ -52,10 +43,8 @@ class GroupEpisode(Recording):
                 probability=self.action.astype(np.float32),
             )
 
-    def expected(self, t: int, cells: int) -> npt.NDArray[np.floating[Any]]:
+    def expected(self, t: int) -> AnyArray:
         """See `Recording`."""
-        if self.belief is None:
-            return np.zeros(cells)
         rows = self.belief[t * len(self.start) : (t + 1) * len(self.start)]
         return np.asarray(rows.sum(axis=0), dtype=np.float64)
 

@@ -25,14 +25,20 @@ from trackmdp.episodes.grids import (
 )
 from trackmdp.episodes.group_episode import GroupEpisode
 from trackmdp.episodes.messages import Form
-from trackmdp.episodes.schema import belief_topic, clock_of, json_bytes
+from trackmdp.episodes.schema import LoggedRun, belief_topic, clock_of, json_bytes
 from trackmdp.episodes.target_colours import shares_of
+from trackmdp.sensing.coverage import Coverage
 
 _BELIEF = np.dtype([("belief", "<f4")])
 _SAYS, _ACTIVE_SAYS = constant(_BELIEF), constant(ACTIVE)
 _ABOVE, _UPRIGHT = 0.02, {"x": 0, "y": 0, "z": 0, "w": 1}
 _FAINT = 0.4
 """Opacity of a target that was missed."""
+
+
+def form_of(run: LoggedRun, coverage: Coverage | None = None) -> Form:
+    """The form of the episodes of a log, of one target or of several; see `Form`."""
+    return (GroupForm if run.kinds else Form)(run, coverage)
 
 
 class GroupForm(Form):
@@ -45,7 +51,6 @@ class GroupForm(Form):
 
     def layers(self, episode: GroupEpisode, first_tick: int) -> Iterator[dict[str, bytes]]:
         """See `Form`."""
-        assert episode.belief is not None
         (rows, columns), targets = self.run.size, len(episode.start)
         sensed = episode.action.reshape(-1, rows, columns)
         for t, active in enumerate(boxes_of(sensed)):

@@ -48,14 +48,13 @@ class _Batch:
         self._task, self._costs, self._seeds = rule.task, Costs(rule.task), seeds
         self._shape = len(seeds), len(rule.group)
         # As with one target, moves and reports apart, so that two policies with one seed meet the same targets.
-        self._moves, self._seen = Draws(seeds, self._move_draws), None
+        draw, targets = paths.sampler.draw, self._shape[1]
+        moves = Draws(seeds, lambda count, rng: draw(count * targets, rng).view(count, targets))
+        self._moves, self._seen = moves, None
         if not (rule.task.perfect and rule.task.safe):
-            self._seen = uniform(seeds, "report", self._shape[1])
+            self._seen = uniform(seeds, "report", targets)
         self._taken: list[Columns] = []
         self._kept: list[Beliefs] | None = [] if beliefs else None
-
-    def _move_draws(self, count: int, rng: torch.Generator) -> Tensor:
-        return self._paths.sampler.draw(count * self._shape[1], rng).view(count, self._shape[1])
 
     def run(self) -> list[GroupEpisode]:
         """Step until the last target of the last episode has left, or until the last step allowed."""

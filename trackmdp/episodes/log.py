@@ -99,21 +99,17 @@ class EpisodeLog:
         if self._writer is not None:
             with self._over_at_failure():
                 made = simulate(self._world, policy, episodes, seed=self._seed, names=names)
-                self._add(made, facts)
+                self.add(made, facts)
 
     def add(self, episodes: Episodes | GroupEpisodes, facts: Mapping[str, str]) -> None:
         """Log simulated episodes; `facts` describes their policy in the log, such as its `label`."""
         if self._writer is not None:
             with self._over_at_failure():
-                self._add(episodes, facts)
-
-    def _add(self, episodes: Episodes | GroupEpisodes, facts: Mapping[str, str]) -> None:
-        assert self._writer is not None
-        policy = self._writer.add_policy(facts, episodes.policy)
-        for episode in episodes.complete():
-            self._writer.add(replace(episode, number=self.episodes, policy=policy))
-            self.episodes += 1
-        self._writer.flush()
+                policy = self._writer.add_policy(facts, episodes.policy)
+                for episode in episodes.complete():
+                    self._writer.add(replace(episode, number=self.episodes, policy=policy))
+                    self.episodes += 1
+                self._writer.flush()
 
     def sync(self) -> None:
         """Put all recorded episodes on the disk."""
@@ -168,7 +164,7 @@ class EpisodeLogger(Callback):
 
         def tell(line: str) -> None:
             self._lost = line
-            trainer.console.print(line, markup=False)
+            trainer.console.print(line)
 
         self._log = EpisodeLog(
             self._folder,

@@ -52,7 +52,7 @@ def frame_legend(episode: Recording) -> str:
 def frame(episode: Recording, t: int, task: Task) -> str:
     """The grid at a step, of a large one the part around the targets: they, over the sensors on, over the belief."""
     # digitize gives 0 below 1e-6, 1 below .05, ... 4 from .5 on: an index into the shades.
-    levels = np.digitize(episode.expected(t, task.num_cells), [1e-6, 0.05, 0.2, 0.5])
+    levels = np.digitize(episode.expected(t), [1e-6, 0.05, 0.2, 0.5])
     on = task.covered(episode.action[t]) & ~episode.forced(task.t_max)[t]
     shades = np.array(list(_SHADES))[levels]
     marks = symbols(task.size, episode.target[t], on, found=episode.located[t], empty=shades)
@@ -140,26 +140,23 @@ def play(console: Console, episode: Recording, task: Task, speed: float) -> None
     """Show an episode until it is quit, or all its steps as text where there is no terminal to play at."""
     if not (console.is_terminal and sys.stdin.isatty()):
         for t in range(len(episode)):
-            console.print(f"{sentence(episode, t, task)}\n{frame(episode, t, task)}", markup=False)
-        console.print(frame_legend(episode), markup=False)
+            console.print(f"{sentence(episode, t, task)}\n{frame(episode, t, task)}")
+        console.print(frame_legend(episode))
         return
     state = Playing(len(episode), speed)
     with _keys() as descriptor, Live(console=console, auto_refresh=False, screen=True) as live:
         due = time.monotonic() + 1 / state.speed
         while not state.over:
-            live.update(Text(_screen(episode, state, task)), refresh=True)
+            moves = "paused" if state.paused else f"{state.speed:g} steps/s"
+            shown = f"{sentence(episode, state.t, task)}\n\n{frame(episode, state.t, task)}"
+            shown += f"\n\n{frame_legend(episode)}\n{moves}   {KEYS}"
+            live.update(Text(shown), refresh=True)
             key = _key(descriptor, max(0.0, due - time.monotonic()) if not state.paused else None)
             if key:
                 state.press(key)
             if not key or key == " ":
                 state.tick()
-            due = time.monotonic() + 1 / state.speed if not key or key == " " else due
-
-
-def _screen(episode: Recording, state: Playing, task: Task) -> str:
-    moves = "paused" if state.paused else f"{state.speed:g} steps/s"
-    text = sentence(episode, state.t, task)
-    return f"{text}\n\n{frame(episode, state.t, task)}\n\n{frame_legend(episode)}\n{moves}   {KEYS}"
+                due = time.monotonic() + 1 / state.speed
 
 
 @contextmanager

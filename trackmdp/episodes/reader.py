@@ -15,11 +15,11 @@ from tensordict import TensorDict
 
 from trackmdp.config import train_config_of
 from trackmdp.episodes import schema
-from trackmdp.episodes.container import Container, Damaged, Said, reading
+from trackmdp.episodes.container import Container, Damaged, reading
 from trackmdp.episodes.episode import first_difference
+from trackmdp.episodes.group_messages import form_of
 from trackmdp.episodes.schema import LoggedRun, versions_apart
 from trackmdp.episodes.simulate import resimulate
-from trackmdp.episodes.written import form_of
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import unpacked_policy
@@ -31,7 +31,7 @@ from trackmdp.world.problem import Problem
 from trackmdp.world.problem_file import PROBLEM, problem_in
 
 
-class EpisodeReader:
+class EpisodeReader(ExitStack):
     """The episodes of a finished log, by number.
 
     `reader[12]` is episode 12 as a TensorDict `[T]` with the keys of `TrackEnv`, iteration yields one after another,
@@ -45,11 +45,11 @@ class EpisodeReader:
     """
 
     def __init__(self, file: Path | str) -> None:
+        super().__init__()
         self.file = Path(file)
         self._container = Container(self.file)
+        self.callback(self._container.stream.close)
         self._built: Problem | Group | None = None
-        # Short episodes share a chunk: read one after another, the chunk is unpacked once.
-        self._held: tuple[int, list[Said]] = (-1, [])
         # A constructor that raises leaves nobody to close the file.
         with ExitStack() as opened, reading(self.file):
             opened.callback(self.close)
@@ -61,7 +61,7 @@ class EpisodeReader:
             said = self._metadata(schema.RUN)
         except Damaged as error:
             raise UserError(f"file={self.file}: not a log of trackmdp ({error})") from error
-        self.run = LoggedRun.of(self.file, said)
+        self.run = LoggedRun(self.file, said)
         self._form = form_of(self.run)
         self.end = self._metadata(schema.END)
         count = int(self.end["policies"])
@@ -70,16 +70,6 @@ class EpisodeReader:
         index = self.attachment("episodes.json", self.end["episodes.json.sha256"])
         self.rows: list[dict[str, Any]] = json.loads(index)
         self._rows = {row["episode"]: row for row in self.rows}
-
-    def __enter__(self) -> EpisodeReader:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._container.stream.close()
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -110,14 +100,8 @@ class EpisodeReader:
         """Episode `number`, an `Episode`, or a `GroupEpisode` of several targets."""
         row = self.row(number)
         with reading(self.file):
-            return self._form.decode(row, self._around(row))
-
-    def _around(self, row: dict[str, Any]) -> Iterator[Said]:
-        """The messages of the chunks with an episode; the chunk read last is kept, for the episode after."""
-        for chunk in self._container.chunks_between(int(row["start_time"]), int(row["end_time"])):
-            if self._held[0] != chunk.chunk_start_offset:
-                self._held = chunk.chunk_start_offset, self._container.messages(chunk)
-            yield from self._held[1]
+            ends = int(row["start_time"]), int(row["end_time"])
+            return self._form.decode(row, self._container.messages_around(*ends))
 
     def attachment(self, name: str, sha256: str | None = None) -> bytes:
         """An attachment with its digest, by default that of `trackmdp.run`."""

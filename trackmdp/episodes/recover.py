@@ -14,9 +14,9 @@ from mcap.records import Attachment, Chunk, DataEnd, Metadata
 
 from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged, Said
+from trackmdp.episodes.group_messages import form_of
 from trackmdp.episodes.schema import LoggedRun
 from trackmdp.episodes.writer import EpisodeWriter
-from trackmdp.episodes.written import form_of
 from trackmdp.errors import UserError
 from trackmdp.untrusted import reason
 
@@ -55,11 +55,11 @@ def taken_over(file: Path, target: Path, policies: int) -> EpisodeWriter | None:
     None if they are not all there; `target` is then not left behind.
     """
     writer = _rewrite(file, target, [], most=policies)
-    if writer is not None and writer.policies < policies:
-        writer.abandon()
-        writer.part.unlink()
-        return None
     if writer is not None:
+        if writer.policies < policies:
+            writer.abandon()
+            writer.part.unlink()
+            return None
         writer.flush()
     return writer
 
@@ -149,7 +149,7 @@ def _messages(stream: BinaryIO, parts: _Parts, damaged: list[str]) -> Iterator[S
 def _begin(file: Path, target: Path, parts: _Parts, damaged: list[str]) -> EpisodeWriter | None:
     """The new log, if all that it begins with has been found."""
     if schema.RUN in parts.metadata:
-        run = LoggedRun.of(file, parts.metadata[schema.RUN])
+        run = LoggedRun(file, parts.metadata[schema.RUN])
         with _noting(damaged):
             # Without the problem, the log could not be simulated again.
             tables = {n: parts.attached(n, run.said.get(f"{n}.sha256")) for n in run.tables}

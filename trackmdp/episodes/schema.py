@@ -202,11 +202,20 @@ class LoggedRun:
         kinds: of several targets, for each the number of its motion; empty in a log of one target.
 
     Raises:
-        ValueError, KeyError: one is missing, or is no number.
+        UserError: they are of another format, or describe no world; the message names `file`.
     """
 
-    def __init__(self, said: Mapping[str, str]) -> None:
-        self.said, rows = dict(said), int(said["size"])
+    def __init__(self, file: Path, said: Mapping[str, str]) -> None:
+        if (found := said.get("format_version")) != LOG_FORMAT:
+            writer = said.get("trackmdp", "unknown")
+            raise UserError(
+                f"file={file}: format {found} (trackmdp {writer}), expected format {LOG_FORMAT}"
+            )
+        with decoded(f"file={file}", "a log of trackmdp"):
+            self._read(dict(said))
+
+    def _read(self, said: dict[str, str]) -> None:
+        self.said, rows = said, int(said["size"])
         self.size = rows, int(said.get("columns", rows))
         self.cells = math.prod(self.size)
         self.sensors = int(said.get("sensors", self.cells))
@@ -246,18 +255,3 @@ class LoggedRun:
             topic: (name, said | {"properties": said["properties"] | more.get(topic, {})})
             for topic, (name, said) in SCHEMAS.items()
         }
-
-    @classmethod
-    def of(cls, file: Path, said: Mapping[str, str]) -> LoggedRun:
-        """The metadata of the log `file`.
-
-        Raises:
-            UserError: it is of another format, or describes no world.
-        """
-        if (found := said.get("format_version")) != LOG_FORMAT:
-            writer = said.get("trackmdp", "unknown")
-            raise UserError(
-                f"file={file}: format {found} (trackmdp {writer}), expected format {LOG_FORMAT}"
-            )
-        with decoded(f"file={file}", "a log of trackmdp"):
-            return cls(said)

@@ -18,15 +18,6 @@ _NAMED = 4
 """Of more targets than these it is said how many were located."""
 
 
-def _outcome(episode: Recording, t: int, task: Task) -> str:
-    """The outcome of step `t`: exited, forced, detected or missed."""
-    if episode.target[t] == task.num_cells:
-        return "exited"
-    if episode.misses[t] > task.t_max:
-        return "forced"
-    return "detected" if episode.located[t] else "missed"
-
-
 def where(cell: int, columns: int) -> str:
     """A cell in words, counted from 1."""
     return f"row {cell // columns + 1}, column {cell % columns + 1}"
@@ -58,14 +49,13 @@ def sentence(episode: Recording, t: int, task: Task) -> str:
 
 def _found(episode: Recording, t: int, task: Task) -> str:
     """What became of the one target."""
-    state = _outcome(episode, t, task)
-    place = where(int(episode.target[t]), task.columns)
-    words = {
-        "exited": "the target has left the grid",
-        "forced": f"safe action forced, target located in {place}",
-    }
-    found, mode = words.get(state, f"target {state} in {place}"), episode.mode
-    if isinstance(task, World) and mode is not None and mode[t] >= 0:
+    if episode.target[t] == task.num_cells:
+        return "the target has left the grid"
+    mode, place = episode.mode, where(int(episode.target[t]), task.columns)
+    found = f"target {'detected' if episode.located[t] else 'missed'} in {place}"
+    if episode.misses[t] > task.t_max:
+        found = f"safe action forced, target located in {place}"
+    if isinstance(task, World) and mode is not None:
         found += f" in {mode_words(task, int(mode[t]))}"
     return found
 

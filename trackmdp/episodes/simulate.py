@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from typing import Any, overload
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from trackmdp.arrays.types import AnyArray
 from trackmdp.environment.paths import PathSampler, path_sampler
 from trackmdp.episodes.actors import Actor, States, actor_of
 from trackmdp.episodes.batch import Episodes
@@ -125,13 +125,14 @@ def resimulate(
     actor = actor_of(problem.task, policy, Costs(problem))
     if actor.policy is not None:
         check_revealed(problem.motion, actor.policy)
+    some = seeds or [0]  # of no episode one is simulated, for the types of its columns
     at_once = [
-        seeds[begin : begin + actor.most_rows] for begin in range(0, len(seeds), actor.most_rows)
+        some[begin : begin + actor.most_rows] for begin in range(0, len(some), actor.most_rows)
     ]
     with preserved_global_rng():
         # Draws of a function or module from torch's global generator are then the same in every call.
-        torch.manual_seed(derive(seeds[0] if seeds else 0, "policy"))
-        parts = [_Batch(problem, sampler, actor, outcomes, some).run() for some in at_once]
+        torch.manual_seed(derive(some[0], "policy"))
+        parts = [_Batch(problem, sampler, actor, outcomes, each).run() for each in at_once]
     return Episodes.of(problem, actor.policy, seeds, parts)
 
 
@@ -219,6 +220,6 @@ class _Batch:
         return torch.zeros_like(place, dtype=torch.bool) if stops is None else stops
 
 
-def _narrow(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _narrow(column: AnyArray) -> AnyArray:
     """A copy, since an expanded tensor has no memory of its own; cells and counts fit into 32 bits."""
     return column.astype(np.int32) if column.dtype == np.int64 else column.copy()

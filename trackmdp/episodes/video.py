@@ -70,17 +70,12 @@ def _frame(axes: Any, task: Task, episode: Recording, t: int) -> None:
     axes.clear()
     rows, columns = task.size
     # The root, so that small probabilities show.
-    shade = np.sqrt(np.minimum(episode.expected(t, task.num_cells), 1.0)).reshape(rows, columns)
+    shade = np.sqrt(np.minimum(episode.expected(t), 1.0)).reshape(rows, columns)
     axes.imshow(shade, cmap="Blues", vmin=0, vmax=1.4)
     sensed: BoolArray = task.covered(episode.action[t]) & ~episode.forced(task.t_max)[t]
-    marks = {
-        "marker": "s",
-        "facecolors": "none",
-        "edgecolors": ORANGE,
-        "s": 70_000 / max(rows, columns) ** 2,
-    }
     down, across = np.divmod(np.flatnonzero(sensed), columns)
-    axes.scatter(across, down, **marks)
+    area = 70_000 / max(rows, columns) ** 2
+    axes.scatter(across, down, marker="s", facecolors="none", edgecolors=ORANGE, s=area)
     several = episode.target.ndim > 1
     paths = np.concatenate([[episode.start], episode.target[: t + 1]]).reshape(t + 2, -1)[-11:].T
     for target, path in enumerate(paths):
@@ -97,8 +92,8 @@ def _frame(axes: Any, task: Task, episode: Recording, t: int) -> None:
     axes.grid(color="#dddddd", linewidth=0.5)
     outcome, _, rest = sentence(episode, t, task).partition("; ")
     axes.set_title(f"{outcome}\n{rest}", loc="left", fontsize=8, wrap=True)
-    key = "square: sensor on   disc: target located   ring: missed"
-    axes.set_xlabel(f"blue: belief   {key}" if episode.complete else key, fontsize=8, color=BLUE)
+    key = "blue: belief   square: sensor on   disc: target located   ring: missed"
+    axes.set_xlabel(key, fontsize=8, color=BLUE)
 
 
 def _target(axes: Any, path: Any, task: Task, located: bool, colour: str) -> None:

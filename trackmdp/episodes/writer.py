@@ -15,8 +15,8 @@ from trackmdp.arrays.files import npz_bytes
 from trackmdp.durable import create, sync, sync_folder
 from trackmdp.episodes import schema
 from trackmdp.episodes.episode import Recording
+from trackmdp.episodes.group_messages import form_of
 from trackmdp.episodes.schema import LoggedRun, time_of
-from trackmdp.episodes.written import form_of
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import packed
 from trackmdp.recordings.tracks import Recorded
@@ -84,7 +84,7 @@ class EpisodeWriter:
             "tick_ns": str(schema.TICK_NS),
             **{f"{name}.sha256": schema.digest(content) for name, content in tables.items()},
         }
-        return cls(file, LoggedRun.of(file, said), tables)
+        return cls(file, LoggedRun(file, said), tables)
 
     def __init__(self, file: Path, run: LoggedRun, tables: Mapping[str, bytes]) -> None:
         self.run = run
@@ -151,7 +151,7 @@ class EpisodeWriter:
         return self.policies - 1
 
     def add(self, episode: Recording) -> None:
-        """Append an episode.
+        """Append an episode with its belief, as of `Episodes.complete`.
 
         Raises:
             OSError: the disk is full, or the file cannot be written for another reason.
@@ -166,10 +166,6 @@ class EpisodeWriter:
             self.flush()
 
     def _add_messages(self, episode: Recording, tick: int, row: dict[str, Any]) -> None:
-        if not episode.complete:
-            raise ValueError(
-                f"episode {episode.number}: without its belief; log those of `Episodes.complete`"
-            )
         # Before the first message of the episode: NaN is no JSON, and a time that does not fit into its field makes
         # the Writer raise within a chunk, which finish() could then no longer write.
         if not (np.isfinite(episode.reward).all() and 0 <= tick < 2**37):
