@@ -52,8 +52,8 @@ def drawn(grouped: Study, panel: Panel, key: str) -> Figure:
 
 
 def test_worlds_that_differ_in_price_make_a_panel(panel: Panel) -> None:
-    assert (panel.title, panel.costs) == ("Z=5", [0.16, 0.22])
-    assert panel.worlds == ["Z=5, c=0.16", "Z=5, c=0.22"]
+    title, worlds = panel
+    assert (title, [*worlds.items()]) == ("Z=5", [(0.16, "Z=5, c=0.16"), (0.22, "Z=5, c=0.22")])
 
 
 def test_the_numbers_of_a_figure_are_those_of_the_runs(grouped: Study, panel: Panel) -> None:

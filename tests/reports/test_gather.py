@@ -21,7 +21,7 @@ from trackmdp.durable import write_json, write_sealed
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.reports import watch
-from trackmdp.reports.finished import MOST_POINTS, averaged_sets, sensed_cells
+from trackmdp.reports.finished import MOST_POINTS, averaged_sets
 from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.page import build
 from trackmdp.reports.results import RESULTS, Results, load_results, save_results
@@ -109,7 +109,7 @@ def test_plans_of_one_cell_are_averaged_by_their_visits() -> None:
     sets[0, [3, 7], 1, 1] = True
     visits[0, 7], visits[1] = 3.0, 5.0
     table = PolicyTable(task, sparse.csr_array(sets.reshape(40, 2)))
-    found = averaged_sets(table, sensed_cells(table), visits.ravel())
+    found = averaged_sets(table, table.seen, visits.ravel())
     assert found[0::2].nnz == 0
     assert found[1::2].toarray() == pytest.approx(np.array([[0.0, 4 / 12], [0.0, 0.0]]))
 
@@ -117,8 +117,12 @@ def test_plans_of_one_cell_are_averaged_by_their_visits() -> None:
 def test_of_sensors_with_footprints_the_cells_in_view_are_drawn() -> None:
     task = Task((1, 3), cost=0.1, t_max=0, safe_cost=1.0, coverage=[[1, 1, 0], [0, 1, 1]])
     table = PolicyTable.from_dense(task, np.eye(3, 2, dtype=bool)[:, None])
-    assert sensed_cells(table).toarray().tolist() == [[1, 1, 0], [0, 1, 1], [0, 0, 0]]
-    everything = sensed_cells(PolicyTable.all_on(task))
+    assert PolicyTable(task, table.written).seen.toarray().tolist() == [
+        [1, 1, 0],
+        [0, 1, 1],
+        [0, 0, 0],
+    ]
+    everything = PolicyTable(task, PolicyTable.all_on(task).written).seen
     assert everything.toarray().all() and everything.shape == (3, 3)
 
 

@@ -107,14 +107,8 @@ def _count(lines: Sequence[Line]) -> str:
     return f"n = {'–'.join(map(str, dict.fromkeys((counts[0], counts[-1]))))}"
 
 
-@dataclass(frozen=True)
-class Panel:
-    """Worlds that are the same but for the price of a sensor, which rises."""
-
-    name: str
-    title: str
-    costs: Sequence[float]
-    worlds: Sequence[str]
+Panel = tuple[str, dict[float, str]]
+"""A title, and price of a sensor, rising -> world: worlds that are the same but for that price."""
 
 
 def panels(study: Study) -> list[Panel]:
@@ -127,9 +121,7 @@ def panels(study: Study) -> list[Panel]:
             rest = ", ".join(part for part in world.split(", ") if not part.startswith("c="))
             groups.setdefault(rest, {})[float(price)] = world
     return [
-        Panel(slug(title), title, sorted(priced), [priced[cost] for cost in sorted(priced)])
-        for title, priced in groups.items()
-        if len(priced) > 1
+        (title, dict(sorted(priced.items()))) for title, priced in groups.items() if len(priced) > 1
     ]
 
 
@@ -147,42 +139,44 @@ def against_price(study: Study, panel: Panel, key: str, threshold: float | None)
 
     The regret is drawn on a logarithmic axis, with a line at the `threshold`.
     """
+    title, worlds = panel
+    costs = [*worlds]
     learned = [
-        Line(method, look, panel.costs, [mean_over_groups([group]) for group in groups])
+        Line(method, look, costs, [mean_over_groups([group]) for group in groups])
         for method, look in looks_of(study.methods).items()
-        if any(groups := [study.values(world, method, key) for world in panel.worlds])
+        if any(groups := [study.values(world, method, key) for world in worlds.values()])
     ]
     if not learned:
         return None
     others = []
     for name in filter(REFERENCES.__contains__, study.references()):
-        row = [study.reference(world, name, key) for world in panel.worlds]
+        row = [study.reference(world, name, key) for world in worlds.values()]
         if np.isfinite(row).all() and (key != "regret" or name in ("Q_MDP", "all on")):
             exact = [MeanInterval(value, None, None, 0) for value in row]
-            others.append(Line(study.title(name), REFERENCES[name], panel.costs, exact))
+            others.append(Line(study.title(name), REFERENCES[name], costs, exact))
 
     def finish(axes: Axes) -> None:
-        if key == "regret":
-            axes.set_yscale("log")
-        else:
+        if key != "regret":
             axes.set_ylim(limits := _limits(learned, others))
             for drawn in axes.lines:
                 heights = np.asarray(drawn.get_ydata())
                 if heights.max() < limits[0] or heights.min() > limits[1]:
                     drawn.set_label(f"_{drawn.get_label()}")  # out of sight: not in the legend
-        if key == "regret" and threshold is not None:
-            axes.axhline(threshold, color=INK, linewidth=0.6, linestyle=":")
-        label_values(axes, panel.costs)
+        else:
+            axes.set_yscale("log")
+            if threshold is not None:
+                axes.axhline(threshold, color=INK, linewidth=0.6, linestyle=":")
+        label_values(axes, costs)
 
     column = QUANTITIES[key]
     return _line_figure(
-        f"{key.replace('_', '-')}-{panel.name}",
-        f"{column.label[0].upper()}{column.label[1:]} by the price of a sensor, {panel.title}; {_count(learned)} seeds",
+        f"{key.replace('_', '-')}-{slug(title)}",
+        f"{column.label[0].upper()}{column.label[1:]} by the price of a sensor, {title}; {_count(learned)} seeds",
         [*learned, *others],
         (Column("c, price of a sensor for one step", 2), column),
         finish,
         floor=FLOOR if key == "regret" else -math.inf,
-        shift=0.03 * float(np.diff(panel.costs).min()) / len(learned),
+        shift=0.03 * float(np.diff(costs).min()) / len(learned),
     )
 
 

@@ -55,16 +55,17 @@ def _figures(summary: Mapping[str, Any]) -> dict[str, Any]:
     """`FIGURES` of a summary, of all targets together, and `HELD_OUT` where there are validation tracks."""
     if several := summary.get("several"):
         found = {**summary, **_together(several["figures"]), **several}
-        return {name: found.get(name) for name in FIGURES} | {
-            "optimal_lower": _best_known(several),
-            "optimal_upper": several["upper"],
-        }
+        # Known to be attained: proved, or simulated of the merged optimum.
+        merged = _together(several["merged_optimum"] or {}).get("aihtr")
+        known = [value for value in (several["lower"], merged) if value is not None]
+        ends = {"optimal_lower": max(known, default=None), "optimal_upper": several["upper"]}
+        return {name: found.get(name) for name in FIGURES} | ends
     validation, policy = summary.get("validation"), summary["policy"]
     solved = {f"optimal_{key}": value for key, value in (summary["optimal"] or {}).items()}
     # On recordings figures are compared, and options chosen, by the validation tracks alone.
-    known = {**summary, **(validation or policy), **solved}
+    found = {**summary, **(validation or policy), **solved}
     held_out = {name: policy.get(own) for name, own in _TRACKED.items()} if validation else {}
-    return {name: known.get(name) for name in FIGURES} | held_out
+    return {name: found.get(name) for name in FIGURES} | held_out
 
 
 def _references(summary: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -96,12 +97,6 @@ def _references(summary: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 def _together(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Means of figures of several targets."""
     return {name: each["mean"] for name, each in figures.items() if name in _TRACKED.values()}
-
-
-def _best_known(several: Mapping[str, Any]) -> float | None:
-    """The largest AIHTR known to be attained: proved, or simulated of the merged optimum."""
-    merged = _together(several["merged_optimum"] or {}).get("aihtr")
-    return max((value for value in (several["lower"], merged) if value is not None), default=None)
 
 
 def read_curve(place: Path, summary: Mapping[str, Any]) -> Sequence[Sequence[float]]:
@@ -147,7 +142,8 @@ def read_map(place: Path, run: FinishedRun, world: str, method: str) -> Mapped |
         raise UserError(f"{place / 'policy.npz'}: not the policy of this run")
     if not table.deterministic:
         raise UserError(f"{place / 'policy.npz'}: sets drawn at random, so that there is no map")
-    sets = sensed_cells(table)
+    # `[keys (t_max + 1), M]`: cells in view of the sensors on.
+    sets = PolicyTable(table.task, table.written).seen
     if table.task.keyed:
         sets = averaged_sets(table, sets, key_visits(problem, table))
     kernel, bound, simple = _references_by_cell(problem)
@@ -162,17 +158,12 @@ def read_map(place: Path, run: FinishedRun, world: str, method: str) -> Mapped |
     )
 
 
-def sensed_cells(table: PolicyTable) -> sparse.csr_array:
-    """`[keys (t_max + 1), M]` bool: cells in view of the sensors that a deterministic policy switches on."""
-    return PolicyTable(table.task, table.written).seen
-
-
 def averaged_sets(table: PolicyTable, sets: sparse.csr_array, visits: Array) -> sparse.csr_array:
     """`[M (t_max + 1), M]`, means of `sets` `[keys (t_max + 1), M]` over the keys of each cell.
 
     Args:
         table: the policy.
-        sets: see `sensed_cells`.
+        sets: cells in view of the sensors on, with each key and n.
         visits: `[keys]`, weights: expected visits of each key.
     """
     task = table.task

@@ -77,12 +77,13 @@ def run_folders(folder: Path, plan: Mapping[str, Any] | None) -> list[str]:
                 names.add(os.path.relpath(real, root))
     # The folder of the sweep itself is a run where it holds a config.
     names -= set() if (folder / "config.yaml").is_file() else {"."}
-    return sorted(name for name in names if not _is_block(folder / name))
-
-
-def _is_block(place: Path) -> bool:
-    """Whether a folder is the block of a run: RUN/blocks/00012."""
-    return place.parent.name == "blocks" and (place.parent.parent / "config.yaml").is_file()
+    # Without blocks of runs, such as RUN/blocks/00012.
+    above = {name: (folder / name).parent for name in names}
+    return sorted(
+        name
+        for name, place in above.items()
+        if place.name != "blocks" or not (place.parent / "config.yaml").is_file()
+    )
 
 
 def _read(place: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]]:

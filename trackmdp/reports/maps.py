@@ -5,8 +5,7 @@ On a large grid the number of sensors in place of the sets, and means over squar
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TypeAlias
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -36,8 +35,8 @@ _AFTER = ("just located (n = 0)", "after one miss (n = 1)")
 _SIDE = 0.92
 """Side of a drawn cell: the gap shows the grid without lines."""
 
-_Size: TypeAlias = tuple[int, int]
-_Tiles: TypeAlias = dict[str, Array]
+_Size = tuple[int, int]
+_Tiles = dict[str, Array]
 """Numbers `[rows of tiles, columns of tiles]` by heading."""
 
 
@@ -78,16 +77,20 @@ def _table_of_sets(
     name: str, title: str, drawn: Mapped, sets: Sequence[Array], possible: Sequence[BoolArray]
 ) -> Table:
     """A row for each located cell and number of misses that can happen."""
+    columns = drawn.size[1]
     rows: Rows = [
-        [x, n, float(on[x].sum()), int(can[x].sum()), _cells_text(on[x], drawn.size)]
+        [
+            *(x, n, float(on[x].sum()), int(can[x].sum())),
+            " ".join(f"{j // columns + 1}.{j % columns + 1}" for j in np.flatnonzero(on[x])),
+        ]
         for x in range(len(drawn.value))
         for n, (on, can) in enumerate(zip(sets, possible, strict=False))
         if can[x].any()
     ]
     digits = 2 if drawn.averaged else 0
-    columns = [Column("located in cell"), Column("misses n"), Column("cells sensed", digits)]
-    columns += [Column("possible cells"), Column("which (row.column)")]
-    return Table(name, title, columns, rows)
+    heads = [Column("located in cell"), Column("misses n"), Column("cells sensed", digits)]
+    heads += [Column("possible cells"), Column("which (row.column)")]
+    return Table(name, title, heads, rows)
 
 
 def missing(drawn: Sequence[Mapped]) -> _Tiles:
@@ -155,7 +158,13 @@ def _shaded(
     side = _side(size)
     if side > 1:
         title += f"; means over tiles of {side} x {side} cells"
-    return draw_figure(_tiles_table(name, title, tiles, side), 2.4, paint)
+    # A row for each tile, by the row and column of its first cell.
+    rows: Rows = [
+        [side * i + 1, side * j + 1, *(float(values[i, j]) for values in tiles.values())]
+        for i, j in np.ndindex(*next(iter(tiles.values())).shape)
+    ]
+    columns = [Column("row"), Column("column"), *(Column(label, 4) for label in tiles)]
+    return draw_figure(Table(name, title, columns, rows), 2.4, paint)
 
 
 def _side(size: _Size) -> int:
@@ -173,16 +182,6 @@ def binned(values: Array, size: _Size) -> Array:
     sums = np.add.reduceat(sums, begins[1], axis=1)
     rows, columns = (np.diff([*begin, length]) for begin, length in zip(begins, size, strict=True))
     return sums / (rows[:, None] * columns)
-
-
-def _tiles_table(name: str, title: str, tiles: Mapping[str, Array], side: int) -> Table:
-    """A row for each tile, by the row and column of its first cell."""
-    rows: Rows = [
-        [side * i + 1, side * j + 1, *(float(values[i, j]) for values in tiles.values())]
-        for i, j in np.ndindex(*next(iter(tiles.values())).shape)
-    ]
-    columns = [Column("row"), Column("column"), *(Column(label, 4) for label in tiles)]
-    return Table(name, title, columns, rows)
 
 
 def _possible(sets: Sequence[Array], drawn: Mapped, steps: int) -> list[BoolArray]:
@@ -247,7 +246,3 @@ def _farthest(cells: BoolArray, size: _Size) -> int:
     return min(
         3, int(max(np.abs(down - row).max(initial=0), np.abs(across - column).max(initial=0)))
     )
-
-
-def _cells_text(on: Array, size: _Size) -> str:
-    return " ".join(f"{j // size[1] + 1}.{j % size[1] + 1}" for j in np.flatnonzero(on))

@@ -7,16 +7,16 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
-from typing import Any, TypeAlias
+from typing import Any
 
 from trackmdp.reports import figures, idea, maps, summaries, tradeoffs
 from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.results import Mapped, Results
 from trackmdp.reports.style import Figure, Say
-from trackmdp.reports.tables import Table, paragraphs
+from trackmdp.reports.tables import Column, Table, paragraphs
 from trackmdp.untrusted import printable
 
-Part: TypeAlias = "str | Table | Sequence[Figure]"
+Part = str | Table | Sequence[Figure]
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,10 @@ def build(
         extra: further sections, shown before the list of all runs.
         say: receives progress.
     """
-    missing = [Section("missing", "Missing runs", [summaries.missing_table(results.anomalies)])]
+    caption = "Runs that are missing or differ from the others"
+    lost = [[anomaly.run, anomaly.text] for anomaly in results.anomalies]
+    table = Table("missing", caption, [Column("run"), Column("reason")], lost)
+    missing = [Section("missing", "Missing runs", [table])]
     if not results.runs:
         return Report(_about(results), missing)
     say("figures")

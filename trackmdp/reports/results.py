@@ -75,7 +75,10 @@ def checked(run: FinishedRun) -> FinishedRun:
     Raises:
         Exception: of any kind, for values of another kind; call it inside `untrusted.decoded`.
     """
-    plain = {printable(key): _printable(value) for key, value in run.settings.items()}
+    plain = {
+        printable(key): printable(value) if isinstance(value, str) else value
+        for key, value in run.settings.items()
+    }
     names = {key: str(plain[key]) for key in ("algo.name", "kernel.name")}
     numbers = _numbers(run.figures)
     missing = [key for key in NEEDED if numbers[key] is None]
@@ -85,10 +88,6 @@ def checked(run: FinishedRun) -> FinishedRun:
     points = [tuple(map(float, point)) for point in run.curve]
     settings = plain | names | {"seed": int(plain["seed"])}
     return FinishedRun(run.name, settings, numbers, others, points)
-
-
-def _printable(value: Any) -> Any:
-    return printable(value) if isinstance(value, str) else value
 
 
 def _numbers(figures: Mapping[str, Any]) -> dict[str, float | None]:

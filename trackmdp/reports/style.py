@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import chain, cycle
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import numpy.typing as npt
-
+from trackmdp.arrays.types import AnyArray
 from trackmdp.reports.tables import Table
 from trackmdp.reports.ticks import Axes as Axes
 from trackmdp.reports.ticks import label_ticks
@@ -22,7 +21,7 @@ if TYPE_CHECKING:  # an extra, and a second to import
     from matplotlib import figure
 
 Canvas: TypeAlias = "figure.Figure"
-Say: TypeAlias = Callable[[str], None]
+Say = Callable[[str], None]
 """Receives short progress messages."""
 
 WIDTH = 4.3
@@ -140,7 +139,7 @@ def tidy(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def grid_lines(axes: Axes, x: npt.NDArray[Any], y: npt.NDArray[Any]) -> None:
+def grid_lines(axes: Axes, x: AnyArray, y: AnyArray) -> None:
     """Lines between the cells of a grid, at the rising places `x` and `y`."""
     axes.vlines(x, y[0], y[-1], colors=LINE, linewidths=0.5)
     axes.hlines(y, x[0], x[-1], colors=LINE, linewidths=0.5)

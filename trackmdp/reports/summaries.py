@@ -8,7 +8,6 @@ from statistics import fmean
 from trackmdp.config.compose import compose
 from trackmdp.errors import UserError
 from trackmdp.reports.grouping import OPEN, Study
-from trackmdp.reports.results import Anomaly
 from trackmdp.reports.tables import Cell, Column, Rows, Table, interval_columns
 from trackmdp.statistics import iqm, mean_over_groups
 
@@ -117,13 +116,6 @@ def runs_table(study: Study) -> Table:
     columns = [Column("world"), Column("method"), Column("seed"), *FIGURES.values(), *OPEN_ENDS]
     columns += [Column("regret per step to the best known", 5), Column("folder")]
     return Table("runs", f"All {len(rows)} finished runs", columns, rows)
-
-
-def missing_table(anomalies: Sequence[Anomaly]) -> Table:
-    """Runs that are missing, mixed or damaged."""
-    rows = [[anomaly.run, anomaly.text] for anomaly in anomalies]
-    columns = [Column("run"), Column("reason")]
-    return Table("missing", "Runs that are missing or differ from the others", columns, rows)
 
 
 def _within_column(threshold: float | None) -> list[Column]:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trackmdp.reports.figures import Panel
+from trackmdp.reports.figures import Panel, slug
 from trackmdp.reports.grouping import Study
 from trackmdp.reports.style import (
     BLUE,
@@ -88,10 +88,11 @@ def swept_figure(study: Study, panel: Panel) -> Figure | None:
     The frontier is the hull of the best policies known: a mixture of two neighbours attains each of its points. A
     policy may lie above it, as D is paid as well.
     """
-    learned = {method: _learned(study, panel, method) for method in study.methods}
+    title, worlds = panel
+    learned = {method: _learned(study, worlds, method) for method in study.methods}
     best = [
         _Place(price, *(study.reference(world, "best known", key) for key in _PLANE))
-        for price, world in zip(panel.costs, panel.worlds, strict=True)
+        for price, world in worlds.items()
     ]
     best = [each for each in best if np.isfinite(each).all()]
     hull, name = upper_hull(best), study.title("best known")
@@ -108,29 +109,25 @@ def swept_figure(study: Study, panel: Panel) -> Figure | None:
         legend(figure, axes)
 
     rows: Rows = [[name, *each, each in hull, None] for each in best]
-    seeds = {
-        (method, price): len(study.of(world, method))
-        for price, world in zip(panel.costs, panel.worlds, strict=True)
-        for method in study.methods
-    }
+    counts = [0]
     for method, places in learned.items():
-        rows += [[method, *each, None, seeds[method, each.price]] for each in places]
-    counts = (seeds[method, each.price] for method in learned for each in learned[method])
-    count = max(counts, default=0)
-    title = (
-        f"Accuracy against sensors per step at all prices, {panel.title}; line: mixtures of two "
-        f"policies, {name}; n = {count} seeds"
+        seeds = [len(study.of(worlds[each.price], method)) for each in places]
+        rows += [[method, *each, None, n] for each, n in zip(places, seeds, strict=True)]
+        counts += seeds
+    caption = (
+        f"Accuracy against sensors per step at all prices, {title}; line: mixtures of two "
+        f"policies, {name}; n = {max(counts)} seeds"
     )
     columns = [Column("policy"), Column("c", 2), Column("sensors per step", 3)]
     columns += [Column("accuracy", 4), Column("on the line"), Column("n")]
-    table = Table(f"frontier-{panel.name}", title, columns, rows)
-    return draw_figure(table, 3.4, paint) if count else None
+    table = Table(f"frontier-{slug(title)}", caption, columns, rows)
+    return draw_figure(table, 3.4, paint) if max(counts) else None
 
 
-def _learned(study: Study, panel: Panel, method: str) -> list[_Place]:
+def _learned(study: Study, worlds: Mapping[float, str], method: str) -> list[_Place]:
     """Means over seeds at each price."""
     found = []
-    for price, world in zip(panel.costs, panel.worlds, strict=True):
+    for price, world in worlds.items():
         sensors, accuracy = (study.values(world, method, key) for key in _PLANE)
         if sensors and accuracy:
             # Means of both are what a run drawn at random attains: all have the same expected steps.

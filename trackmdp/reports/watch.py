@@ -82,8 +82,8 @@ def watch(sweep: Path, console: Console, every: float) -> int:
                 if status.state not in ("waiting", shown.get(status.name)):
                     shown[status.name] = status.state
                     name, *rest = status.cells
-                    console.print(f"{name}: {', '.join(filter(None, rest))}", markup=False)
-        console.print(_counts(found), markup=False)
+                    console.print(f"{name}: {', '.join(filter(None, rest))}")
+        console.print(_counts(found))
     return sum(status.state == "done" for status in found)
 
 
