@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_dir
 
 from trackmdp.app.composer import register
 from trackmdp.config import GROUPS, ROOTS, Option, conf_dir, options
-from trackmdp.config.compose import from_hydra
+from trackmdp.config.compose import composed_values, config_of
 
 REFUSED = {("evaluate", f"log={name}") for name in ("csv", "tensorboard", "wandb", "mlflow")} | {
     (command, "kernel=tracks") for command in ("evaluate", "solve", "frontier", "verify")
@@ -56,7 +56,8 @@ def composed(command: str, *overrides: str) -> Any:
     if command == "evaluate" and not any(word.startswith("baseline=") for word in words):
         words.insert(0, "baseline=qmdp")
     with initialize_config_dir(config_dir=conf_dir(), version_base="1.3"):
-        return from_hydra(compose(command, overrides=words), ROOTS[command], Path("/typed/here"))
+        values = composed_values(compose(command, overrides=words), ROOTS[command])
+        return config_of(values, ROOTS[command], Path("/typed/here"))
 
 
 def of_command(command: str) -> list[tuple[str, Option]]:

@@ -1,27 +1,34 @@
-"""From typed words to a composed config, by Hydra's public calls; a config is data, and names no code."""
+"""From typed words to a composed config, by Hydra's public calls; a config is data, and names no code.
+
+Hydra's search path is `conf/`, folders of installed plugins, and the user's folders, with files read within limits.
+"""
 
 from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Self
 
 from hydra import compose, initialize_config_dir
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigResult
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
-from trackmdp.app.sources import searched
 from trackmdp.app.words import diagnose
 from trackmdp.config import GROUPS, ROOTS, conf_dir
 from trackmdp.config.registry import load_plugins, register_resolvers
 from trackmdp.config.sweeping import PLUGINS
 from trackmdp.errors import UserError
+from trackmdp.untrusted import parse_yaml, read_text
 
 _NO_LOGGING = {"version": 1, "root": None, "disable_existing_loggers": False}
 """`hydra/job_logging=none`; all others name classes and files."""
@@ -39,10 +46,10 @@ def register() -> None:
     warnings.filterwarnings("error", message=r"provider=")
     load_plugins()  # installed packages add their choices to `GROUPS`
     # With a schema Hydra refuses an unknown key or a wrong type while it composes.
-    schemas = {("", command): root for command, root in ROOTS.items()}
-    schemas |= {
+    groups: dict[str, Any] = {"": ROOTS, **GROUPS}
+    schemas = {
         (group, name): schema
-        for group, members in GROUPS.items()
+        for group, members in groups.items()
         for name, schema in members.items()
     }
     if schemas == _stored:  # making nodes of them takes longer than composing
@@ -60,7 +67,61 @@ def register() -> None:
             store.repo["hydra"][part].pop(f"{name}.yaml", None)
 
 
-class Composer:
+_folders: list[tuple[str, str]] = []
+"""(provider, path) of the folders that `_Folders` adds, while `searched` is open."""
+
+
+@contextmanager
+def searched(users: Sequence[Path], plugins: Sequence[Path]) -> Iterator[None]:
+    """Hydra, initialised inside, also searches these folders, after the main one and in this order.
+
+    Args:
+        users: named on the command line.
+        plugins: of installed packages.
+    """
+    # Hydra constructs both itself, without arguments: their data is in this module.
+    for kind in (_UserFolder, _Folders):
+        Plugins.instance().register(kind)
+    # The scheme before `://` selects the class that reads a folder; "file" is Hydra's own.
+    _folders[:] = [
+        ("command-line", f"{_UserFolder.scheme()}://{path.absolute()}") for path in users
+    ]
+    _folders.extend(("plugin", f"file://{path.absolute()}") for path in plugins)
+    try:
+        yield
+    finally:
+        _folders.clear()
+
+
+class _Folders(SearchPathPlugin):
+    """Hydra asks every such plugin for changes to its search path."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for provider, path in _folders:
+            # After `conf/`: where both have a file of one name, Hydra takes the first.
+            search_path.append(provider, path)
+
+
+class _UserFolder(FileConfigSource):
+    """A folder of the user's: Hydra reads a file once it is YAML of limited size and depth."""
+
+    @staticmethod
+    def scheme() -> str:
+        return "data"
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """The config at `config_path`, such as ``experiment/mine``.
+
+        Raises:
+            UserError: it is no YAML of plain data.
+        """
+        file = Path(self.path) / self._normalize_file_name(config_path)
+        if file.is_file():
+            parse_yaml(read_text(file, links=True), str(file))
+        return super().load_config(config_path)
+
+
+class Composer(ExitStack):
     """Composes configs of one command; Hydra is initialised while the context is open.
 
     Args:
@@ -80,28 +141,25 @@ class Composer:
         name: str | None = None,
         folders: Sequence[str] = (),
     ) -> None:
+        super().__init__()
         self.command, self.name, self.words = command, name or command, list(words)
         for folder in folders:
             if not os.path.isdir(folder):  # noqa: PTH112  False where pathlib raises: a name that is too long
                 raise UserError(f"--config-dir {folder}: no such folder")
         self._folders = list(map(Path, folders))
-        self._opened = ExitStack()
 
     def __enter__(self) -> Self:
         # Plugins of this package's are loaded by it, and their folders are searched as soon as Hydra is initialised.
         register()
-        self._opened.enter_context(searched(self._folders, load_plugins()))
+        # Afterwards, as the last: Hydra's state is a global of the process, and closing restores the one from before.
+        self.callback(lambda: GlobalHydra.instance().clear())
+        self.enter_context(searched(self._folders, load_plugins()))
         # Without `version_base` Hydra warns, and behaves as its version 1.1. An absolute folder works for a clone, an
         # editable install and a wheel; a relative one works for a clone alone.
-        self._opened.enter_context(
+        self.enter_context(
             initialize_config_dir(conf_dir(), job_name="trackmdp", version_base="1.3")
         )
         return self
-
-    def __exit__(self, *_: object) -> None:
-        # In this order: closing restores what was initialised before, and Hydra's state is a global of the process.
-        self._opened.close()
-        GlobalHydra.instance().clear()
 
     def __call__(self, words: Sequence[str]) -> DictConfig:
         """The config of `words`, with Hydra's own under `hydra`; `${hydra:...}` then refers to it.

@@ -49,7 +49,7 @@ def launch(command: str, words: Sequence[str]) -> int:
     """
     args = parse(words)
     if command == "compare":
-        args.overrides = gathered(args.overrides, ("run", "baseline"))
+        args.overrides = gathered(args.overrides)
     with Composer(command, args.overrides, args.config_name, args.config_dir) as compose:
         # Before anything is checked or made: `--cfg job` also shows a config that a run would refuse.
         if answer(compose, args):
@@ -73,7 +73,7 @@ def _run_once(compose: Composer) -> int:
     with read_write(cfg.hydra):
         cfg.hydra.run.dir = str(ready.folder)  # a run that is resumed writes to its own
     try:
-        announce(compose.command, ready.cfg, ready.folder)
+        announce(ready)
         grids = OmegaConf.select(cfg, "hydra.sweeper.blocks")  # a single run does not read them
         if grids and not ready.cfg.quiet:
             say(

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from trackmdp import config
 from trackmdp.config import CommandConfig, TrainConfig, WorldConfig, load_run_config
 from trackmdp.config.checks import refuse_ignored
-from trackmdp.config.compose import from_hydra
+from trackmdp.config.compose import composed_values, config_of
 from trackmdp.config.learning import file_of_classes
 from trackmdp.config.logs import require_packages
 from trackmdp.config.resume import by_key, continued, key_of, run_folder
@@ -63,7 +63,8 @@ def prepare(command: str, composed: DictConfig, words: Sequence[str]) -> Prepare
     Raises:
         UserError: an option is not allowed, or the file it names is missing or not as expected.
     """
-    cfg = from_hydra(composed, config.ROOTS[command], Path.cwd())
+    schema = config.ROOTS[command]
+    cfg = config_of(composed_values(composed, schema), schema, Path.cwd())
     resumes = getattr(cfg, "resume", None)
     if not resumes:
         refuse_ignored(cfg, by_key(words))
@@ -103,26 +104,21 @@ def check(command: str, cfg: CommandConfig, folder: Path, words: Sequence[str]) 
     return Prepared(command, cfg, folder, problem)
 
 
-def announce(command: str, cfg: CommandConfig, folder: Path, label: str = "") -> None:
+def announce(ready: Prepared, label: str = "") -> None:
     """The first line at the terminal, before anything heavy is imported; `label` goes before it in brackets."""
+    cfg, to = ready.cfg, f"-> {shown(ready.folder)}"
     if cfg.quiet or not isinstance(cfg, WorldConfig):
         return
-    label = f"({label}) " if label else ""
-    subject = next(
-        (
-            getattr(cfg, name).name
-            for name in ("algo", "baseline", "solver")
-            if getattr(cfg, name, None)
-        ),
-        "",
-    )
+    head = f"({label}) {ready.command}" if label else ready.command
     if runs := _runs(cfg):
-        say(f"{label}{command} {', '.join(runs)} -> {shown(folder)}")
+        say(f"{head} {', '.join(runs)} {to}")
         return
+    chosen = (getattr(cfg, name, None) for name in ("algo", "baseline", "solver"))
+    subject = next((f" {each.name}" for each in chosen if each), "")
     rows, columns = cfg.grid.sides
     seed = f", seed {cfg.seed}" if hasattr(cfg, "seed") else ""
     where = f"on a {rows}x{columns} grid, T_max {cfg.grid.t_max}, kernel {cfg.kernel.name}{seed}"
-    line, to = label + " ".join(f"{command} {subject} {where}".split()), f"-> {shown(folder)}"
+    line = f"{head}{subject} {where}"
     # On two lines rather than broken within a name, at the width that every terminal has.
     say(f"{line}{' ' if len(line) + len(to) < 80 else chr(10) + '  '}{to}")
 

@@ -37,10 +37,10 @@ def parsed(word: str) -> Override:
     return override
 
 
-def gathered(words: Sequence[str], names: Iterable[str]) -> list[str]:
-    """The words, with those of one of some names put together: run=a run=b becomes runs=[a,b]."""
+def gathered(words: Sequence[str]) -> list[str]:
+    """The words of `compare`, with runs and baselines put together: run=a run=b becomes runs=[a,b]."""
     kept = list(words)
-    for name in names:
+    for name in ("run", "baseline"):
         values = [word.partition("=")[2] for word in words if word.startswith(f"{name}=")]
         if values:
             kept = [word for word in kept if not word.startswith(f"{name}=")]

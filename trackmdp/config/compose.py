@@ -10,7 +10,7 @@ import os
 from collections.abc import Iterator, Mapping
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -23,11 +23,9 @@ from trackmdp.config.checks import (
 )
 from trackmdp.config.options import GROUPS, Node, Option, leaves, options
 from trackmdp.config.registry import choice_values, read_values, resolved
-from trackmdp.config.roots import ROOTS, CommandConfig
+from trackmdp.config.roots import ROOTS
 from trackmdp.config.tree import build_config
 from trackmdp.errors import UserError
-
-_C = TypeVar("_C", bound=CommandConfig)
 
 
 def compose(
@@ -86,20 +84,6 @@ def command_values(command: str, typed: Mapping[str, Any]) -> dict[str, Any]:
     return values
 
 
-def from_hydra(cfg: DictConfig, root: type[_C], folder: Path) -> _C:
-    """The typed, checked config of a composition by Hydra.
-
-    Args:
-        cfg: the composition.
-        root: schema of the command.
-        folder: of relative paths.
-
-    Raises:
-        UserError: an unknown key (also one added with `+`), a missing value, a wrong type, or a broken rule.
-    """
-    return config_of(composed_values(cfg, root), root, folder)
-
-
 def composed_values(cfg: DictConfig, schema: type[Any]) -> dict[str, Any]:
     """The values of a composition by Hydra, unresolved, with the name of each choice, which is the type of its node.
 
@@ -130,9 +114,17 @@ def composed_values(cfg: DictConfig, schema: type[Any]) -> dict[str, Any]:
 
 
 def config_of(values: dict[str, Any] | DictConfig, schema: type[Any], folder: Path) -> Any:
-    """The dataclasses of the values, resolved and checked."""
-    cfg = build_config(resolved(values), schema)
-    validate(cfg)
+    """The dataclasses of the values, resolved and checked.
+
+    Args:
+        values: of `composed_values`, or of the files.
+        schema: of the command.
+        folder: of relative paths.
+
+    Raises:
+        UserError: an unknown key (also one added with `+`), a missing value, a wrong type, or a broken rule.
+    """
+    cfg = validate(build_config(resolved(values), schema))
     absolute_paths(cfg, folder)
     return cfg
 

@@ -15,8 +15,12 @@ from trackmdp.app.composer import Composer
 from trackmdp.app.sweep.configs import Configs
 from trackmdp.app.sweep.plan import combinations, plan
 from trackmdp.config import ROOTS
-from trackmdp.config.compose import from_hydra
+from trackmdp.config.compose import composed_values, config_of
 from trackmdp.errors import UserError
+
+
+def typed_config(composed: Any) -> Any:
+    return config_of(composed_values(composed, ROOTS["train"]), ROOTS["train"], Path.cwd())
 
 
 class Counting:
@@ -57,7 +61,7 @@ def test_every_config_is_the_one_that_hydra_composes(
     compose = Counting(composer)
     configs = Configs("train", compose)
     for line in combinations([], words.split()):
-        expected = from_hydra(composer(line), ROOTS["train"], Path.cwd())
+        expected = typed_config(composer(line))
         assert configs(line) == (expected, "")
     assert compose.calls == calls
 
@@ -68,7 +72,7 @@ def test_a_number_out_of_range_is_refused_as_hydra_refuses_it(bad: str, composer
     key = bad.partition("=")[0]
     assert configs([f"{key}=1"])[1] == ""
     refusals: list[Any] = []
-    for refuse in (configs, lambda words: from_hydra(composer(words), ROOTS["train"], Path.cwd())):
+    for refuse in (configs, lambda words: typed_config(composer(words))):
         try:
             refusals.append(refuse([bad])[1])  # type: ignore[operator]
         except UserError as error:

@@ -40,8 +40,8 @@ def run(cfg: FrontierConfig, folder: Path, world: Problem) -> float:
     _show(console, found, folder)
     if found.interrupted:
         raise KeyboardInterrupt
-    asked = {name: getattr(cfg, name) for name in ("accuracy", "sensors")}
-    given = {name: value for name, value in asked.items() if value is not None}
+    asked = ("accuracy", "sensors")
+    given = {name: value for name in asked if (value := getattr(cfg, name)) is not None}
     answers = {name: found.at(**{name: value}) for name, value in given.items()}
     write_json(folder / "frontier.json", _report(cfg, found, rows, answers))
     _draw(folder, found, answers)

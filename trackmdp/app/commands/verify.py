@@ -72,10 +72,7 @@ def show_checks(console: Console, checks: list[Check], folder: Path) -> None:
     )  # two lines of `not claimed; does not hold`, to leave room for statements
     for check in checks:
         note = f" ({check.note})" if check.note else ""
-        shown.add_row(f"{check.name}: {check.statement}{note}", _deviation(check), check.verdict)
+        off = "–" if np.isneginf(check.deviation) else f"{check.deviation:.2g}"
+        shown.add_row(f"{check.name}: {check.statement}{note}", off, check.verdict)
     console.print(shown)
     console.print(f"{summarize_checks(checks)}; results in {folder}")
-
-
-def _deviation(check: Check) -> str:
-    return "–" if np.isneginf(check.deviation) else f"{check.deviation:.2g}"

@@ -207,7 +207,7 @@ def _run(job: Job) -> Outcome:
     try:
         # Checked when the sweep was planned, but hours may lie between, and files may have gone since.
         ready = check(job.command, job.cfg, job.folder, job.words)
-        announce(job.command, ready.cfg, job.folder, job.label)
+        announce(ready, job.label)
         value = ready.run()
         return Outcome(0, float(value) if isinstance(value, (int, float)) else None)
     except Preempted as error:

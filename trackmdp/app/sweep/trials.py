@@ -201,8 +201,8 @@ def _study(cfg: OptunaConfig, folder: Path) -> Iterator[Any]:
 
 def _enqueue_interrupted(study: Any) -> None:
     """Ask first for the trials of an earlier call that were interrupted or failed."""
-    done = [trial.params for trial in study.trials if trial.state == TrialState.COMPLETE]
-    queued = [
+    known = [trial.params for trial in study.trials if trial.state == TrialState.COMPLETE]
+    known += [
         trial.system_attrs.get("fixed_params")
         for trial in study.trials
         if trial.state == TrialState.WAITING
@@ -213,12 +213,10 @@ def _enqueue_interrupted(study: Any) -> None:
             study.tell(trial.number, state=TrialState.FAIL)
         # `trial.state` is the state as listed above, so that a trial just marked as failed is still among those
         # here.
-        if trial.state in (TrialState.RUNNING, TrialState.FAIL) and trial.params not in [
-            *done,
-            *queued,
-        ]:
+        stopped = trial.state in (TrialState.RUNNING, TrialState.FAIL)
+        if stopped and trial.params not in known:
             study.enqueue_trial(trial.params)
-            queued.append(trial.params)
+            known.append(trial.params)
 
 
 def _completed(study: Any) -> int:
