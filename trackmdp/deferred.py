@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from importlib.util import spec_from_loader
@@ -28,12 +29,11 @@ class _Deferred(ModuleType):
         self._marked: list[tuple[str, Callable[..., Any]]] = []
         self._disabled: list[tuple[Any, bool]] = []
 
-    def allow_in_graph(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        self._marked.append(("allow_in_graph", function))
-        return function
+        self.allow_in_graph = partial(self._mark, "allow_in_graph")
+        self.assume_constant_result = partial(self._mark, "assume_constant_result")
 
-    def assume_constant_result(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        self._marked.append(("assume_constant_result", function))
+    def _mark(self, mark: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        self._marked.append((mark, function))
         return function
 
     def disable(self, function: Any = None, recursive: bool = True, **options: Any) -> Any:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from importlib.abc import Loader, MetaPathFinder
+from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
 from types import ModuleType
 
@@ -31,23 +31,8 @@ def _register(registration: ModuleType) -> None:
         )
 
 
-class _Registering(Loader):
-    """Loads Gymnasium's registry with its own loader, then registers."""
-
-    def __init__(self, own: Loader) -> None:
-        self._own = own
-
-    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
-        return self._own.create_module(spec)
-
-    def exec_module(self, module: ModuleType) -> None:
-        module.__loader__ = self._own
-        self._own.exec_module(module)
-        _register(module)
-
-
 class _Finder(MetaPathFinder):
-    """Finds Gymnasium's registry as Python does, and hands it to `_Registering`."""
+    """Finds Gymnasium's registry as Python does; once it is loaded, `_register` follows."""
 
     def find_spec(
         self,
@@ -60,7 +45,13 @@ class _Finder(MetaPathFinder):
         sys.meta_path.remove(self)
         found = PathFinder.find_spec(fullname, path, target)
         if found is not None and found.loader is not None:
-            found.loader = _Registering(found.loader)
+            load = found.loader.exec_module
+
+            def load_and_register(module: ModuleType) -> None:
+                load(module)
+                _register(module)
+
+            found.loader.exec_module = load_and_register  # type: ignore[method-assign]
         return found
 
 

@@ -146,15 +146,15 @@ def _refused(word: str) -> Any:
     raise ValueError(f"{word} is not JSON")
 
 
-def read_object(file: Path, *, most: int = SMALL, source: str = "") -> dict[str, Any]:
+def read_object(file: Path, *, most: int = SMALL) -> dict[str, Any]:
     """The JSON object in a file.
 
     Raises:
         UserError: it cannot be read, or is something else.
     """
-    content = parse_json(read_text(file, most=most, source=source), source or str(file))
+    content = parse_json(read_text(file, most=most), str(file))
     if not isinstance(content, dict):
-        raise UserError(f"{source or file}: expected a JSON object")
+        raise UserError(f"{file}: expected a JSON object")
     return content
 
 

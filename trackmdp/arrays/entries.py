@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
-Numbers: TypeAlias = npt.NDArray[np.integer[Any]]
+from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
 
 
-def row_index(matrix: sparse.csr_array) -> Numbers:
+def row_index(matrix: sparse.csr_array) -> IndexArray:
     """`[nnz]` the row of each stored entry."""
     # indptr = (0, 2, 2, 5) has rows of 2, 0 and 3 entries: 0 0 2 2 2. int64, so that row · M + cell never overflows.
     return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
 
 
-def with_data(matrix: sparse.csr_array, data: npt.NDArray[Any]) -> sparse.csr_array:
+def with_data(matrix: sparse.csr_array, data: AnyArray) -> sparse.csr_array:
     """The same entries with other numbers `[nnz]`; their places are shared, not copied."""
     return sparse.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
 
@@ -34,25 +33,25 @@ def short_indices(matrix: sparse.csr_array) -> sparse.csr_array:
 
 
 def ones_at(
-    rows: Numbers, columns: Numbers, shape: tuple[int, int], kind: Any = np.bool_
+    rows: IndexArray, columns: IndexArray, shape: tuple[int, int], kind: Any = np.bool_
 ) -> sparse.csr_array:
     """Ones in these places `[E]`, true or as numbers of a `kind`, of which those in one place are added up."""
     return sparse.csr_array((np.ones(len(rows), dtype=kind), (rows, columns)), shape=shape)
 
 
-def summing(index: Numbers, count: int) -> sparse.csr_array:
+def summing(index: IndexArray, count: int) -> sparse.csr_array:
     """`[count, E]` 0/1 matrix that sums over the entries of each `index` `[E]`."""
     return ones_at(index, np.arange(len(index)), (count, len(index)), np.float64)
 
 
-def per_row(rows: Numbers, values: npt.NDArray[np.float64], count: int) -> npt.NDArray[np.float64]:
+def per_row(rows: IndexArray, values: Array, count: int) -> Array:
     """`[count]` sums of `values` over equal `rows`."""
     return np.bincount(rows, weights=values, minlength=count).astype(np.float64, copy=False)
 
 
 def padded_rows(
     matrix: sparse.csr_array, none: int = 0, *, more: int = 0
-) -> tuple[Numbers, npt.NDArray[np.float64]]:
+) -> tuple[IndexArray, Array]:
     """Columns and numbers of the entries of each row, `[R + more, Z]` each, Z >= 1; filled up with `none` and 0."""
     rows, count = row_index(matrix), np.diff(matrix.indptr)
     place = rows, np.arange(matrix.nnz) - matrix.indptr[rows]
@@ -62,12 +61,12 @@ def padded_rows(
     return columns, numbers
 
 
-def ranks(rows: Numbers) -> Numbers:
+def ranks(rows: IndexArray) -> IndexArray:
     """`[E]` the place of each entry in its row, of `rows` `[E]` in order: of 0 0 2 they are 0 1 0."""
     return np.arange(len(rows)) - np.searchsorted(rows, rows)
 
 
-def among(known: Numbers, wanted: Numbers) -> tuple[Numbers, npt.NDArray[np.bool_]]:
+def among(known: IndexArray, wanted: IndexArray) -> tuple[IndexArray, BoolArray]:
     """Where `wanted` numbers are among `known` ones, which are in order, and whether they are; in their shape."""
     # With 37 and 41, 41 is at place 1, and so is 38, another number. The place of 50 would be 2: beyond the last.
     place = np.minimum(np.searchsorted(known, wanted), max(len(known) - 1, 0))

@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.config.sensors import LARGEST_PRICE
 from trackmdp.errors import UserError
 
-Range: TypeAlias = tuple[Callable[[npt.NDArray[np.float64]], npt.NDArray[np.bool_]], str]
+Range = tuple[Callable[[Array], BoolArray], str]
 """A test of numbers, and its range in words."""
 
 PRICES: Range = (
@@ -25,7 +26,7 @@ PROBABILITIES: Range = (lambda p: (p > 0) & (p <= 1), "a probability above 0, at
 
 def one_each(
     source: str, given: npt.ArrayLike, count: int | tuple[int, int], each: str, allowed: Range
-) -> npt.NDArray[np.float64]:
+) -> Array:
     """`[count]` numbers, from one for all or from one for each.
 
     Args:

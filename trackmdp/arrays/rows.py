@@ -5,16 +5,16 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.arrays.entries import row_index
+from trackmdp.arrays.types import Array, Indices
 
 _LEAF = 128  # numpy adds up to so many numbers in one leaf of its summation tree
 _LANES = 3  # log2 of the 8 interleaved partial sums of a leaf
 
 
-def pairwise_row_sums(matrix: sparse.csr_array) -> npt.NDArray[np.float64]:
+def pairwise_row_sums(matrix: sparse.csr_array) -> Array:
     """`[B]` row sums, equal to those of ``matrix.toarray().sum(axis=1)`` to the bit.
 
     Whether a kernel is handed over dense or sparse must not show in a single digit. numpy adds pairwise: a row of M
@@ -44,7 +44,7 @@ def merged(
 
 
 @lru_cache(maxsize=8)
-def _codes(columns: int) -> npt.NDArray[np.int64]:
+def _codes(columns: int) -> Indices:
     """`[M]` the way of each column up numpy's summation tree, the lowest bit first.
 
     A leaf of 100 columns: columns 0 to 95 lie in the lanes 0, 1, ..., 7, 0, 1, ...; columns 96 to 99 are added one by

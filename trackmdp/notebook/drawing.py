@@ -36,6 +36,7 @@ def draw(picture: Picture, axes: Any = None) -> Any:
 
 
 def _heat(picture: Any, axes: Any) -> None:
+    from matplotlib.patches import Rectangle
     from matplotlib.ticker import MaxNLocator
 
     rows, columns = picture.values.shape
@@ -49,22 +50,15 @@ def _heat(picture: Any, axes: Any) -> None:
     for which, length in ((axes.set_xticks, columns), (axes.set_yticks, rows)):
         step = -(-length // 8)  # eight labels at most
         which(range(0, length, step), [str(place + 1) for place in range(0, length, step)])
-    _framed(axes, picture.mark, columns, ORANGE)
+    for cell in picture.mark:
+        row, column = divmod(cell, columns)
+        corner = (column - 0.42, row - 0.42)
+        axes.add_patch(Rectangle(corner, 0.84, 0.84, fill=False, edgecolor=ORANGE, linewidth=1.5))
     if picture.path:
         down, across = zip(*(divmod(cell, columns) for cell in picture.path), strict=True)
         axes.plot(across, down, color=ORANGE, linewidth=1)
         faces = ["none" if missed else ORANGE for missed in picture.hollow]
         axes.scatter(across, down, s=24, facecolors=faces, edgecolors=ORANGE, zorder=3)
-
-
-def _framed(axes: Any, cells: Any, columns: int, colour: str) -> None:
-    """Frames around some cells of a grid."""
-    from matplotlib.patches import Rectangle
-
-    for cell in cells:
-        row, column = divmod(cell, columns)
-        corner = (column - 0.42, row - 0.42)
-        axes.add_patch(Rectangle(corner, 0.84, 0.84, fill=False, edgecolor=colour, linewidth=1.5))
 
 
 def _lines(picture: Any, axes: Any) -> None:
