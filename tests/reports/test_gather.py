@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 from scipy import sparse
 
 from tests.reports.sweeps import VERSIONS, write_curve, write_run, write_sweep
@@ -28,6 +27,7 @@ from trackmdp.reports.results import RESULTS, Results, load_results, save_result
 from trackmdp.sensing.task import Task
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluate import evaluate
+from trackmdp.training.display import make_console
 from trackmdp.training.folders import read_summary, write_summary
 from trackmdp.training.lock import locked
 from trackmdp.world.make import build_world
@@ -353,7 +353,7 @@ def test_a_folders_name_is_a_name_everywhere(
         assert "\\input" not in table.latex()
         cells = (cell for line in table.csv().splitlines() for cell in line.split(","))
         assert not any(cell.startswith(("=", "@")) for cell in cells)
-    watch.watch(sweep, Console(force_terminal=False), 0.01)
+    watch.watch(sweep, make_console(quiet=False), 0.01)
     said = capsys.readouterr().out
     assert "\x1b" not in said
     assert "[x]: done" in said

@@ -234,11 +234,9 @@ def _first(logged: Episode, again: Episode, belief_tolerance: float) -> str | No
     steps = min(len(logged), len(again))
     known = [name for name in PER_STEP if name != "mode" or logged.mode is not None]
     found = [_differing(logged, again, name, steps, belief_tolerance) for name in known]
-    earliest = min(
-        (each for each in found if each is not None), default=None, key=lambda each: each[0]
-    )
-    if earliest is not None:
-        return f"step {earliest[0]}, {earliest[1]}"
+    if apart := list(filter(None, found)):
+        step, how = min(apart, key=lambda each: each[0])
+        return f"step {step}, {how}"
     if len(logged) != len(again):
         return f"length: logged {len(logged)} steps, re-simulated {len(again)}"
     return None

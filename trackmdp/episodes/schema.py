@@ -84,17 +84,22 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
 Cells are numbered row by row from the top left; -1 stands for no cell: a target that exited, nothing observed.
 """
 
-_PER_TARGET = ("n", "last_cell", "target", "target_x", "target_y", "obs")
+_INTEGER = {"type": "integer"}
+_EACH_TARGET = {"type": "array", "items": _INTEGER}
+_OF_SEVERAL: dict[str, dict[str, Any]] = {
+    "/step": dict.fromkeys(
+        ("n", "last_cell", "target", "target_x", "target_y", "obs"), _EACH_TARGET
+    )
+    | {"n_present": _INTEGER},
+    "/episode": {"start": _EACH_TARGET},
+}
+"""Topic -> properties of its messages, in logs of several targets."""
 
 
-def _of_several(topic: str) -> tuple[str, dict[str, Any]]:
-    """The schema of a topic where an entry of each target takes the place of one."""
+def _with(topic: str, fields: dict[str, Any], kind: str = ".") -> tuple[str, dict[str, Any]]:
+    """The schema of a topic with other or further properties; `kind` takes the place of the point in its name."""
     name, said = SCHEMAS[topic]
-    numbers = {"type": "array", "items": {"type": "integer"}}
-    of_each = dict.fromkeys(_PER_TARGET if topic == "/step" else ("start",), numbers)
-    inside = {"n_present": {"type": "integer"}} if topic == "/step" else {}
-    fields = said["properties"] | of_each | inside
-    return name.replace(".", ".Group"), said | {"properties": fields}
+    return name.replace(".", kind), said | {"properties": said["properties"] | fields}
 
 
 def belief_topic(target: int) -> str:
@@ -107,11 +112,11 @@ def schemas_of_several(targets: int) -> dict[str, tuple[str, dict[str, Any]]]:
     scene = ("foxglove.SceneUpdate", _schema("foxglove.SceneUpdate", "the targets, by number"))
     single = {topic: SCHEMAS[topic] for topic in ("/grid", "/active", "/part")}
     of_each = {belief_topic(each): SCHEMAS["/grid"] for each in range(targets)}
-    steps = {topic: _of_several(topic) for topic in ("/step", "/episode")}
+    steps = {topic: _with(topic, fields, ".Group") for topic, fields in _OF_SEVERAL.items()}
     return steps | single | of_each | {"/targets": scene}
 
 
-MODE = {"/step": {"mode": {"type": "integer"}}, "/episode": {"start_mode": {"type": "integer"}}}
+MODE = {"/step": {"mode": _INTEGER}, "/episode": {"start_mode": _INTEGER}}
 """Topic -> further properties of its messages, in logs of targets with a mode."""
 
 
@@ -212,20 +217,17 @@ class LoggedRun:
                 f"file={file}: format {found} (trackmdp {writer}), expected format {LOG_FORMAT}"
             )
         with decoded(f"file={file}", "a log of trackmdp"):
-            self._read(dict(said))
-
-    def _read(self, said: dict[str, str]) -> None:
-        self.said, rows = said, int(said["size"])
-        self.size = rows, int(said.get("columns", rows))
-        self.cells = math.prod(self.size)
-        self.sensors = int(said.get("sensors", self.cells))
-        self.modes, self.t_max = int(said.get("modes", 0)), int(said["t_max"])
-        self.kinds = tuple(map(int, said.get("targets", "").split()))
-        if len(self.kinds) > MOST_TARGETS or any(
-            kind not in {0, *(each + 1 for each in self.kinds[:k])}
-            for k, kind in enumerate(self.kinds)
-        ):
-            raise ValueError("targets of other motions than those in the file")
+            self.said, rows = dict(said), int(said["size"])
+            self.size = rows, int(said.get("columns", rows))
+            self.cells = math.prod(self.size)
+            self.sensors = int(said.get("sensors", self.cells))
+            self.modes, self.t_max = int(said.get("modes", 0)), int(said["t_max"])
+            self.kinds = tuple(map(int, said.get("targets", "").split()))
+            if len(self.kinds) > MOST_TARGETS or any(
+                kind not in {0, *(each + 1 for each in self.kinds[:k])}
+                for k, kind in enumerate(self.kinds)
+            ):
+                raise ValueError("targets of other motions than those in the file")
 
     @property
     def motions(self) -> range:
@@ -250,8 +252,5 @@ class LoggedRun:
         """Topic -> (name of its schema, JSON schema)."""
         if self.kinds:
             return schemas_of_several(len(self.kinds))
-        more = MODE if self.modes else {}
-        return {
-            topic: (name, said | {"properties": said["properties"] | more.get(topic, {})})
-            for topic, (name, said) in SCHEMAS.items()
-        }
+        modes = MODE if self.modes else {}
+        return SCHEMAS | {topic: _with(topic, fields) for topic, fields in modes.items()}

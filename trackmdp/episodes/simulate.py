@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from trackmdp.arrays.numbers import whole_number
 from trackmdp.arrays.types import AnyArray
 from trackmdp.environment.paths import PathSampler, path_sampler
 from trackmdp.episodes.actors import Actor, States, actor_of
@@ -80,8 +81,7 @@ def simulate(
         UserError: the policy is made for another grid, or is none; `episodes` or `seed` is no such number.
     """
     check_problem(problem, "simulate")
-    if not isinstance(episodes, (int, np.integer)) or episodes < 0:
-        raise UserError(f"simulate: episodes={episodes}, expected an integer >= 0")
+    whole_number("simulate: episodes", episodes, 0)
     if isinstance(problem, Group):
         policy = group_rule(problem, policy, **of_group)
     elif of_group:

@@ -44,9 +44,8 @@ def log_ticks(low: float, high: float, most: int) -> list[float]:
 
 def tick_labels(values: Sequence[float]) -> list[str]:
     """Texts of round values: 0.05, 300, 20k, 1M; powers such as 10⁻³ for small values, and where they span 10⁴."""
-    if min(values) < 1e-2 or max(values) >= 1e4 * min(values):
-        return [_power(value) for value in values]
-    return [_short(value) for value in values]
+    powers = min(values) < 1e-2 or max(values) >= 1e4 * min(values)
+    return list(map(_power if powers else _short, values))
 
 
 def label_values(axes: Axes, values: Sequence[float]) -> None:
