@@ -232,6 +232,15 @@ def test_sets_are_read_back_from_a_list_and_from_an_array_file(
                 ("null", "expected 1 lists of sensors"),
             )
         ),
+        *(
+            (f'{{"memory": {memory}, "size": [2, 2], "t_max": 0, "sets": {{}}}}', said)
+            for memory, said in (
+                ("5", "not sets .memory 5: expected an object with kind and clip"),
+                ("[]", "not sets .memory"),
+                ('{"kind": ["cell"], "clip": 2}', "not sets .memory"),
+                ('{"kind": "cell"}', "clip=None: expected an integer"),
+            )
+        ),
         ("[]", "expected a JSON object"),
     ],
 )

@@ -332,7 +332,7 @@ def test_more_targets_than_tracks_are_refused_before_training(
 
 def test_95_percent_are_named_where_an_interval_is_shown() -> None:
     few, many = (evaluate(group(by_hand(*[[0, 1, 2], [1, 2]] * k)), "none") for k in (1, 8))
-    assert few.about == "1 groups of held-out tracks"
+    assert few.about == "1 group of held-out tracks"
     assert many.about == "8 groups of held-out tracks, 95 %"
 
 

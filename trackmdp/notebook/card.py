@@ -103,6 +103,11 @@ def span(low: float, high: float) -> str:
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
+def counted_words(count: int, unit: str, more: str = "") -> str:
+    """A number of units, such as `1 group of tracks` and `2 groups of tracks`; `more` follows the unit."""
+    return f"{count:,} {unit}{'' if count == 1 else 's'}{more}"
+
+
 def grid_words(size: Sequence[int]) -> str:
     """The size of a grid in words, such as `6 x 9 cells`."""
     return f"{size[0]} x {size[1]} cells"

@@ -142,8 +142,10 @@ def read_sets(task: Task, file: str | Path) -> PolicyTable:
     content = read_object(file, most=LARGE)
     with decoded(str(file), "sets"):
         memory = content.get("memory", {"kind": "cell", "clip": 2})
+        if not isinstance(memory, dict) or not isinstance(memory.get("kind"), str):
+            raise ValueError(f"memory {memory!r:.40}: expected an object with kind and clip")
         own = task.remembering(
-            memory["kind"], clip=memory["clip"], revealed=memory.get("revealed", 1)
+            memory["kind"], clip=memory.get("clip"), revealed=memory.get("revealed", 1)
         )
         return _listed(own, content)
 

@@ -11,6 +11,7 @@ from trackmdp.arrays.entries import ranks
 from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError
 from trackmdp.grid.place import Place, projected, projection
+from trackmdp.notebook.card import counted_words
 from trackmdp.recordings.positions import Positions
 from trackmdp.recordings.tracks import Tracks, ends_of
 
@@ -208,7 +209,7 @@ def _cut(
     )
     counts = {
         "steps outside of the grid": int((~inside).sum()),
-        f"steps in {int((~kept).sum()):,} tracks of fewer than {grid.shortest} cells": int(
+        f"steps in {counted_words(int((~kept).sum()), 'track')} of fewer than {grid.shortest} cells": int(
             lengths[~kept].sum()
         ),
         "steps kept": len(made.cells),

@@ -12,6 +12,7 @@ import numpy as np
 
 from trackmdp.arrays.types import Array
 from trackmdp.episodes.episode import Episode
+from trackmdp.notebook.card import counted_words
 from trackmdp.recordings.gridding import said
 from trackmdp.recordings.tracks import Recorded
 from trackmdp.reports.page import Report, Section
@@ -89,9 +90,9 @@ def _about(problem: Recorded, report: Mapping[str, Any]) -> str:
         f"{each:g}" for each in np.unique([problem.cost.min(), problem.cost.max()])
     )
     text = (
-        f"{report['tracks']:,} held-out tracks, {report['learned_from']:,} to learn from, {report['validation']:,} to "
-        f"choose by; {problem.rows} x {problem.columns} cells, T_max {problem.t_max}, r {problem.reward:g}, "
-        f"c {prices}, D {problem.safe_cost:g}."
+        f"{counted_words(report['tracks'], 'held-out track')}, {report['learned_from']:,} to learn from, "
+        f"{report['validation']:,} to choose by; {problem.rows} x {problem.columns} cells, "
+        f"T_max {problem.t_max}, r {problem.reward:g}, c {prices}, D {problem.safe_cost:g}."
     )
     return f"{text} Loaded: {said(problem.loaded)}." if problem.loaded else text
 
@@ -108,7 +109,7 @@ def _table(names: Mapping[str, str], report: Mapping[str, Any]) -> Table:
             factor = 100 if column.unit == "%" else 1
             row += [None if end is None else factor * end for end in ends]
         rows.append(row)
-    caption = f"Means over {report['tracks']:,} held-out tracks with 95 % intervals over targets"
+    caption = f"Means over {counted_words(report['tracks'], 'held-out track')} with 95 % intervals over targets"
     return Table("held-out", caption, columns, rows)
 
 

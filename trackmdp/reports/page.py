@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from importlib.resources import files
 from typing import Any
 
+from trackmdp.notebook.card import counted_words
 from trackmdp.reports import figures, idea, maps, summaries, tradeoffs
 from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.results import Mapped, Results
@@ -141,16 +142,12 @@ def _about(results: Results) -> str:
     manifest = results.manifest
     planned = manifest.get("planned")
     found = len(results.runs)
-    count = f"{found} of {planned} planned runs" if planned else _runs_in_words(found)
+    count = f"{found} of {planned} planned runs" if planned else counted_words(found, "run")
     machines = manifest.get("machines", ())
     where = "; ".join(f"{m.get('processor', '?')}, {m.get('cores', '?')} cores" for m in machines)
     hours = manifest.get("wall_seconds", 0) / 3600
     took = f"{hours:.1f} hours" if hours >= 1 else f"{60 * hours:.1f} minutes"
     return f"{count}, {took} of run time in all{', on ' + where if where else ''}."
-
-
-def _runs_in_words(count: int) -> str:
-    return "1 run" if count == 1 else f"{count} runs"
 
 
 def _outcome(grouped: Study, threshold: float | None) -> list[Part]:
@@ -210,7 +207,7 @@ def _made(manifest: Mapping[str, Any]) -> dict[str, str]:
             shown = (
                 f"{name} {it}" for name, it in entry.items() if name != "runs" and it is not None
             )
-            facts[f"{label}, {_runs_in_words(entry['runs'])}"] = ", ".join(shown)
+            facts[f"{label}, {counted_words(entry['runs'], 'run')}"] = ", ".join(shown)
     times = (f"{manifest.get(f'{kind}_seconds', 0):,.0f} s {kind}" for kind in ("wall", "cpu"))
     return facts | {
         "Run time": ", ".join(times),

@@ -18,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from trackmdp.errors import UserError
+from trackmdp.notebook.card import counted_words
 from trackmdp.reports.gather import planned, run_folders
 from trackmdp.training.folders import METRICS, SUMMARY, run_of
 from trackmdp.untrusted import decoded, known_object, opened, printable
@@ -168,4 +169,4 @@ def _counts(found: Sequence[Status]) -> str:
     counts = Counter(status.state for status in found)
     order = ("done", "running", "failed", "cut", "waiting")
     parts = (f"{counts[state]} {state}" for state in order if counts[state])
-    return f"{len(found)} runs: {', '.join(parts)}"
+    return f"{counted_words(len(found), 'run')}: {', '.join(parts)}"

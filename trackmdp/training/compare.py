@@ -10,7 +10,7 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 
 from trackmdp.errors import UserError
-from trackmdp.notebook.card import Card, Carded, decimal, percent
+from trackmdp.notebook.card import Card, Carded, counted_words, decimal, percent
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.recordings.tracks import Recorded
 from trackmdp.solvers.evaluate import group_rule
@@ -54,17 +54,17 @@ class Comparison(Carded):
     Attributes:
         policies: in the order given; differences are to the first.
         tracks: held-out tracks that the figures are means over; None where they are exact.
-        units: the words for these; of several targets groups of tracks, or simulated episodes.
+        units: the word for one of these, and what follows it; of several targets groups of tracks, or episodes.
     """
 
     policies: tuple[Compared, ...]
     tracks: int | None
-    units: str = "held-out tracks"
+    units: tuple[str, ...] = ("held-out track",)
 
     @property
     def about(self) -> str:
         """What the figures are means over."""
-        return "exact" if self.tracks is None else f"{self.tracks:,} {self.units}"
+        return "exact" if self.tracks is None else counted_words(self.tracks, *self.units)
 
     def card(self) -> Card:
         """A line for each policy; differences are to the first."""
@@ -87,7 +87,7 @@ class Comparison(Carded):
         """The conclusion for each policy but the first."""
         first, *others = self.policies
         exact = self.tracks is None
-        unit = "episode" if exact or self.units != "held-out tracks" else "track"
+        unit = "episode" if exact or self.units != ("held-out track",) else "track"
         return [_sentence(first, each, unit, exact=exact) for each in others]
 
 
@@ -183,7 +183,7 @@ def _of_group(group: Group, rules: Mapping[str, Rule]) -> Comparison:
         Compared(name, {key: getattr(each, key) for key in FIGURES}, each.less(first).aihtr)
         for name, each in found.items()
     )
-    units = "simulated episodes" if group.recorded is None else "groups of held-out tracks"
+    units = ("simulated episode",) if group.recorded is None else ("group", " of held-out tracks")
     return Comparison(rows, None if exact else len(first.totals), units)
 
 

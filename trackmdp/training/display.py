@@ -16,6 +16,7 @@ from rich.status import Status
 from rich.table import Table
 from rich.text import Text
 
+from trackmdp.notebook.card import counted_words
 from trackmdp.signals import handled, stop
 from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.untrusted import printable
@@ -173,7 +174,9 @@ def show_held_out(console: Console, subject: str, report: dict[str, Any]) -> Non
             rows.append(
                 [f"  {subject if name == 'policy' else name}", with_interval(figures[key], *form)]
             )
-    console.print(table(f"{report['tracks']} held-out tracks", ["", "mean (95 % interval)"], rows))
+    console.print(
+        table(counted_words(report["tracks"], "held-out track"), ["", "mean (95 % interval)"], rows)
+    )
 
 
 def with_interval(

@@ -29,7 +29,7 @@ from trackmdp.episodes.player import draw_picture
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.simulate import resimulate, simulate
 from trackmdp.errors import UserError
-from trackmdp.notebook.card import grid_words
+from trackmdp.notebook.card import counted_words, grid_words
 from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import sets_name, write_sets
@@ -188,7 +188,7 @@ def _log(
         raise
     if whole:
         along = " along held-out tracks" if episodes.problem.recorded else ""
-        console.print(f"{log.episodes} episodes{along} in {log.file}")
+        console.print(f"{counted_words(log.episodes, 'episode')}{along} in {log.file}")
 
 
 def _played_back(

@@ -15,6 +15,7 @@ from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
 from trackmdp.episodes.schema import versions_apart
 from trackmdp.errors import RunError, UserError
+from trackmdp.notebook.card import counted_words
 from trackmdp.training.display import make_console, table
 
 
@@ -29,7 +30,7 @@ def run(cfg: ReplayConfig, folder: Path) -> None:  # noqa: ARG001  every file ha
     if cfg.recover:
         saved = recover(file)
         file = saved.file
-        console.print(f"{saved.episodes} episodes -> {file}")
+        console.print(f"{counted_words(saved.episodes, 'episode')} -> {file}")
         for line in saved.damaged:
             console.print(f"lost: {line}")
     with EpisodeReader(file) as reader:
@@ -76,18 +77,19 @@ def _verify(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> None:
         apart = versions_apart(reader.run.said)
         because = f"; made by other versions: {apart}" if apart else ""
         raise RunError(f"file={cfg.file}: {verified.difference}{because}")
-    console.print(f"{verified.episodes} episodes, {verified.steps:,} steps: the same to the bit")
+    episodes = counted_words(verified.episodes, "episode")
+    steps = counted_words(verified.steps, "step")
+    console.print(f"{episodes}, {steps}: the same to the bit")
 
 
 def _list(console: Console, reader: EpisodeReader) -> None:
-    total = sum(row["length"] for row in reader.rows)
+    total = counted_words(sum(row["length"] for row in reader.rows), "step")
+    episodes = counted_words(len(reader), "episode")
     (rows, columns), seed = reader.run.size, reader.run.said.get("seed", "")
     grid = f"{rows}x{columns} grid"
     if reader.run.kinds:
         grid += f" with {len(reader.run.kinds)} targets"
-    console.print(
-        f"{len(reader)} episodes, {total:,} steps on a {grid}, T_max {reader.run.t_max}, seed {seed}"
-    )
+    console.print(f"{episodes}, {total} on a {grid}, T_max {reader.run.t_max}, seed {seed}")
     labels = [reader.policies[row["policy"]].get("label", "") for row in reader.rows]
     one = len(set(labels)) == 1
     if one:

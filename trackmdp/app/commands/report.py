@@ -10,6 +10,7 @@ from rich.text import Text
 from trackmdp.config import ReportConfig
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.errors import require
+from trackmdp.notebook.card import counted_words
 from trackmdp.paper.calibration import compute, load_openings, save_openings
 from trackmdp.paper.sections import sections
 from trackmdp.paper.worlds import PRINTED_QMDP, pairs
@@ -88,4 +89,4 @@ def _tell(console: Console, found: Results, folder: Path) -> None:
         first = found.anomalies[0]
         more = f" and {len(found.anomalies) - 1} more" if len(found.anomalies) > 1 else ""
         console.print(f"missing or mixed: {first.run}: {first.text}{more}")
-    console.print(f"{len(found.runs)} runs; report in {folder / 'report.html'}")
+    console.print(f"{counted_words(len(found.runs), 'run')}; report in {folder / 'report.html'}")

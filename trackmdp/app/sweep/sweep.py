@@ -20,7 +20,7 @@ from trackmdp.config.options import is_number
 from trackmdp.config.resume import by_key, continued
 from trackmdp.durable import csv_text, write_text
 from trackmdp.errors import FAILED, USER_MISTAKE, Preempted, UserError
-from trackmdp.notebook.card import decimal
+from trackmdp.notebook.card import counted_words, decimal
 from trackmdp.signals import Signals
 from trackmdp.training.display import table
 from trackmdp.training.folders import (
@@ -79,7 +79,7 @@ def sweep(
                 job.folder for job in progress(batch, "looked up", console) if _is_finished(job)
             }
             before = f", {len(done)} of them done before" if done else ""
-            console.print(f"{len(batch)} runs{before} -> {shown(folder)}")
+            console.print(f"{counted_words(len(batch), 'run')}{before} -> {shown(folder)}")
             _run([job for job in batch if job.folder not in done], launch, stop)
             skipped |= done
             if stop.received:
@@ -183,7 +183,7 @@ def show_runs(
         "regret per step",
         "reason",
     ]
-    made = table(f"{len(runs)} runs", heads, rows)
+    made = table(counted_words(len(runs), "run"), heads, rows)
     made.columns[1].justify = made.columns[4].justify = "left"
     console.print(made)
     counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))

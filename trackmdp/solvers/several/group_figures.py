@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from trackmdp.arrays.types import Array
-from trackmdp.notebook.card import Card, Carded, decimal
+from trackmdp.notebook.card import Card, Carded, counted_words, decimal
 from trackmdp.statistics import MeanInterval, ratio
 
 _HALF = 1.96
@@ -95,9 +95,9 @@ class GroupEvaluation(Carded):
         """What the figures are means over, and whether they have intervals."""
         if self.exact:
             return "exact"
-        kind = "simulated episodes" if self.controls else "groups of held-out tracks"
+        kind = ("simulated episode",) if self.controls else ("group", " of held-out tracks")
         interval = "" if self.aihtr.low is None else ", 95 %"
-        return f"{len(self.totals):,} {kind}{interval}"
+        return f"{counted_words(len(self.totals), *kind)}{interval}"
 
     def card(self) -> Card:
         """The figures with their intervals."""
