@@ -238,7 +238,7 @@ def test_sets_are_read_back_from_a_list_and_from_an_array_file(
                 ("5", "not sets .memory 5: expected an object with kind and clip"),
                 ("[]", "not sets .memory"),
                 ('{"kind": ["cell"], "clip": 2}', "not sets .memory"),
-                ('{"kind": "cell"}', "clip=None: expected an integer"),
+                ('{"kind": "cell"}', "not sets .no 'clip'"),
             )
         ),
         ("[]", "expected a JSON object"),

@@ -76,6 +76,7 @@ def test_a_file_that_has_changed_is_read_again(tmp_path: Path) -> None:
     [
         ("track,step,cell\n4,0,1\n4,2,1\n", "track 4 has a gap: step 2 follows step 0"),
         ("track,step,cell\n4,0,1\n5,0,2\n4,0,1\n", "track 4 has step 0 twice"),
+        ('track,step,cell\nv,0,1\n"u,0",0,2\n"u,0",0,1\n', "track u,0 has step 0 twice"),
         ("track,cell\n0,1\n0,9\n", "cell of entry 2 is 9, expected 0 to 8 on a grid of 3x3 cells"),
         ("track,cell\n0,-1\n", "cell of entry 1 is -1, expected 0 to 8"),
         ("track,row,column\n0,1,3\n", "column of entry 1 is 3, expected 0 to 2"),
@@ -140,7 +141,7 @@ def test_files_that_are_no_columns_are_refused(tmp_path: Path) -> None:
         assert str(caught.value).startswith(f"kernel.path={tmp_path / name}: {message}")
 
 
-def test_short_tracks_are_refused() -> None:
+def test_short_tracks_are_refused(tmp_path: Path) -> None:
     tracks = by_hand([0, 1, 2], [0, 1], [0], [0, 1, 2, 3])
     assert check_tracks(tracks, 1, "x") is tracks
     with pytest.raises(UserError, match=r"^x: track 2 has 1 cells, expected at least 2$"):
@@ -149,6 +150,9 @@ def test_short_tracks_are_refused() -> None:
         UserError, match=r"^x: track 0 has 3 cells, expected at least 4 \(3 of 4 are too short\)$"
     ):
         check_tracks(tracks, 4, "x")
+    (tmp_path / "t.csv").write_text("track,cell\nbus 7,3\nbus 12,0\nbus 12,1\n")
+    with pytest.raises(UserError, match="track bus 7 has 1 cells, expected at least 2"):
+        read_tracks(tmp_path / "t.csv", 3, exits=True, shortest=2)
 
 
 @given(st.integers(2, 50), st.floats(0.05, 0.95), st.floats(0.05, 0.95), st.integers(0, 2**31))

@@ -129,13 +129,13 @@ def whole_csr(data: Any, indices: Any, indptr: Any, shape: tuple[int, int]) -> s
     return matrix
 
 
-def read_columns(key: str, path: str | Path, *, ids: str) -> dict[str, Array]:
-    """The columns of a .csv file under the names in its first line, or the arrays of an .npz.
+def read_columns(key: str, path: str | Path, *, ids: str) -> tuple[dict[str, Array], list[str]]:
+    """The columns of a .csv file under the names in its first line, or the arrays of an .npz; and the texts of `ids`.
 
     Args:
         key: the option, for messages.
         path: the file.
-        ids: a column that may hold texts, which are numbered 0, 1 ... in sorted order.
+        ids: a column that may hold texts, which are numbered 0, 1 ... in sorted order; of numbers there are none.
 
     Raises:
         UserError: there is no such file, or it does not hold columns of real numbers, all of one length.
@@ -144,9 +144,10 @@ def read_columns(key: str, path: str | Path, *, ids: str) -> dict[str, Array]:
     if suffix not in (".csv", ".npz"):
         raise UserError(f"{source}: expected a .csv or .npz file")
     with _opened(source, Path(path)) as stream:
-        columns = _csv_columns(stream, ids) if suffix == ".csv" else load_npz(stream)
+        columns, texts = _csv_columns(stream, ids) if suffix == ".csv" else (load_npz(stream), [])
     if ids in columns and columns[ids].dtype.kind == "U" and columns[ids].ndim == 1:
-        columns[ids] = np.unique(columns[ids], return_inverse=True)[1]
+        found, columns[ids] = np.unique(columns[ids], return_inverse=True)
+        texts = found.tolist()
     for name, column in columns.items():
         if column.dtype.kind not in "iuf" or column.ndim != 1:
             raise UserError(
@@ -155,7 +156,7 @@ def read_columns(key: str, path: str | Path, *, ids: str) -> dict[str, Array]:
     if len({len(column) for column in columns.values()}) > 1:
         lengths = ", ".join(f"{name} {len(column)}" for name, column in columns.items())
         raise UserError(f"{source}: columns of different lengths ({lengths})")
-    return {name: column.astype(np.float64) for name, column in columns.items()}
+    return {name: column.astype(np.float64) for name, column in columns.items()}, texts
 
 
 def once(read: Callable[..., _T], path: str | Path, *how: Hashable) -> _T:
@@ -205,29 +206,29 @@ def _opened(source: str, file: Path) -> Iterator[BinaryIO]:
         yield stream
 
 
-def _csv_columns(stream: BinaryIO, ids: str) -> dict[str, np.ndarray]:
+def _csv_columns(stream: BinaryIO, ids: str) -> tuple[dict[str, np.ndarray], list[str]]:
     """See `read_columns`."""
     names = first_line(stream)
     if len(set(names)) < len(names):
         raise ValueError(f"two columns of one name in {','.join(names)[:80]}")
     if not stream.read(1):
-        return {name: np.zeros(0) for name in names}
+        return {name: np.zeros(0) for name in names}, []
     stream.seek(-1, os.SEEK_CUR)
-    here = stream.tell()
+    here, texts = stream.tell(), list[str]()
     try:
         table = _csv(stream, comments=None)
     except ValueError:
         if ids not in names:
             raise
         stream.seek(here)
-        table = _csv_of_texts(stream, names.index(ids))
+        table, texts = _csv_of_texts(stream, names.index(ids))
     if table.shape[1] != len(names):
         raise ValueError(f"{len(names)} names in the first line, but {table.shape[1]} columns")
-    return dict(zip(names, table.T, strict=True))
+    return dict(zip(names, table.T, strict=True)), texts
 
 
-def _csv_of_texts(stream: BinaryIO, column: int) -> Array:
-    """The lines that are left, the texts of one column as their places in sorted order."""
+def _csv_of_texts(stream: BinaryIO, column: int) -> tuple[Array, list[str]]:
+    """The lines that are left, the texts of one column as their places in sorted order; and these texts."""
     found: dict[str, int] = {}
 
     def number(text: str) -> int:
@@ -236,9 +237,9 @@ def _csv_of_texts(stream: BinaryIO, column: int) -> Array:
         return found.setdefault(own, len(found))
 
     table = _csv(stream, comments=None, quotechar='"', converters={column: number})
-    place = np.unique(list(found), return_inverse=True)[1]
+    texts, place = np.unique(list(found), return_inverse=True)
     table[:, column] = place[table[:, column].astype(np.int64)]
-    return table
+    return table, texts.tolist()
 
 
 def _csv(stream: BinaryIO, comments: str | None = "#", **how: Any) -> Array:

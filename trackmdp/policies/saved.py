@@ -145,7 +145,7 @@ def read_sets(task: Task, file: str | Path) -> PolicyTable:
         if not isinstance(memory, dict) or not isinstance(memory.get("kind"), str):
             raise ValueError(f"memory {memory!r:.40}: expected an object with kind and clip")
         own = task.remembering(
-            memory["kind"], clip=memory.get("clip"), revealed=memory.get("revealed", 1)
+            memory["kind"], clip=memory["clip"], revealed=memory.get("revealed", 1)
         )
         return _listed(own, content)
 

@@ -23,7 +23,7 @@ from trackmdp.recordings.positions import (
     position_table,
     sumo,
 )
-from trackmdp.recordings.tracks import Tracks, check_tracks, draw_names, read_tracks, split
+from trackmdp.recordings.tracks import Tracks, draw_names, read_tracks, split
 from trackmdp.untrusted import decoded, opened
 
 _GAP = 3
@@ -131,7 +131,7 @@ def read_track_file(
                     f"kernel.{name}={own[name]}: only for positions; {source} holds cells"
                 )
         place = Place.of(*(given[name] for name in ("cell", "origin", "crs")))
-        tracks = check_tracks(read_tracks(path, size, exits=exits), shortest, source)
+        tracks = read_tracks(path, size, exits=exits, shortest=shortest)
         return split(tracks, *draw), {}, place
     for option, expected in (
         ("kernel.step", "seconds from one cell to the next"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Unpack
@@ -211,7 +211,7 @@ class Recorded(Task):
         return replace(self, held_out=self.validation)
 
 
-def read_tracks(path: str | Path, size: Size, *, exits: bool) -> Tracks:
+def read_tracks(path: str | Path, size: Size, *, exits: bool, shortest: int = 1) -> Tracks:
     """Read tracks from a .csv file with a header line, or from arrays of the same names in an .npz file.
 
     The columns are `track` (an integer or a text, the same for all steps of a track; texts are numbered in sorted
@@ -222,16 +222,18 @@ def read_tracks(path: str | Path, size: Size, *, exits: bool) -> Tracks:
         path: the file.
         size: of the grid, one number for a square.
         exits: whether the target left the grid at the end of each track.
+        shortest: fewest cells of a track.
 
     Raises:
-        UserError: the file is not of that form, a cell lies outside the grid, or a step is missing or there twice.
+        UserError: the file is not of that form, a cell lies outside the grid, a step is missing or there twice, or a
+            track is too short.
     """
-    return once(_read, path, grid_size(size), exits)
+    return once(_read, path, grid_size(size), exits, shortest)
 
 
-def _read(path: str | Path, size: tuple[int, int], exits: bool) -> Tracks:
+def _read(path: str | Path, size: tuple[int, int], exits: bool, shortest: int) -> Tracks:
     """See `read_tracks`."""
-    source, columns = f"kernel.path={path}", read_columns("kernel.path", path, ids="track")
+    source, (columns, texts) = f"kernel.path={path}", read_columns("kernel.path", path, ids="track")
     if set(columns) - {"step"} not in _COLUMNS:
         raise UserError(f"{source}: columns {', '.join(columns)}, expected {_FORMAT}")
     if not len(columns["track"]):
@@ -245,13 +247,14 @@ def _read(path: str | Path, size: tuple[int, int], exits: bool) -> Tracks:
     first, begins = ends_of(lengths), None
     if "step" in numbers:
         step = numbers["step"][order]
-        _check_steps(source, track, step)
+        _check_steps(source, track, step, texts)
         begins = step[first[:-1]] - step.min()
-    return Tracks(cell, first, np.full(len(names), exits), names, begins)
+    made = Tracks(cell, first, np.full(len(names), exits), names, begins)
+    return check_tracks(made, shortest, source, texts)
 
 
-def check_tracks(tracks: Tracks, shortest: int, source: str) -> Tracks:
-    """Return `tracks` if each has at least `shortest` cells.
+def check_tracks(tracks: Tracks, shortest: int, source: str, texts: Sequence[str] = ()) -> Tracks:
+    """Return `tracks` if each has at least `shortest` cells; `texts` are their ids where these are no numbers.
 
     Raises:
         UserError: one has fewer.
@@ -260,9 +263,9 @@ def check_tracks(tracks: Tracks, shortest: int, source: str) -> Tracks:
     if short.any():
         first = int(np.flatnonzero(short)[0])
         others = f" ({short.sum()} of {len(tracks)} are too short)" if short.sum() > 1 else ""
+        name = texts[first] if texts else tracks.names[first]
         raise UserError(
-            f"{source}: track {tracks.names[first]} has {tracks.lengths[first]} cells, expected at least "
-            f"{shortest}{others}"
+            f"{source}: track {name} has {tracks.lengths[first]} cells, expected at least {shortest}{others}"
         )
     return tracks
 
@@ -358,14 +361,15 @@ def _cells(source: str, numbers: dict[str, Indices], size: tuple[int, int]) -> I
     return numbers["cell"] if "cell" in numbers else numbers["row"] * columns + numbers["column"]
 
 
-def _check_steps(source: str, track: Indices, step: Indices) -> None:
+def _check_steps(source: str, track: Indices, step: Indices, texts: Sequence[str]) -> None:
     jump = np.diff(step)
     bad = (np.diff(track) == 0) & (jump != 1)
     if not bad.any():
         return
     at = int(np.flatnonzero(bad)[0])
+    name = texts[track[at]] if texts else track[at]
     if jump[at] == 0:
-        raise UserError(f"{source}: track {track[at]} has step {step[at]} twice")
+        raise UserError(f"{source}: track {name} has step {step[at]} twice")
     raise UserError(
-        f"{source}: track {track[at]} has a gap: step {step[at + 1]} follows step {step[at]}"
+        f"{source}: track {name} has a gap: step {step[at + 1]} follows step {step[at]}"
     )

@@ -9,6 +9,7 @@ import json
 import os
 import pty
 import resource
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable
@@ -406,12 +407,12 @@ def test_ctrl_c_while_logging_names_the_part_and_how_to_save_it(
 
     with monkeypatch.context() as patch:
         patch.setattr(EpisodeWriter, "finish", stopped)
-        assert main([*LOGGED, f"hydra.run.dir={tmp_path}"]) == 130
+        assert main([*LOGGED, f"hydra.run.dir={tmp_path / 'my runs'}"]) == 130
     said, last = capsys.readouterr().err.splitlines()
     assert last == "trackmdp evaluate: interrupted"
-    part = tmp_path / "episodes.mcap.part"
+    part = tmp_path / "my runs" / "episodes.mcap.part"
     assert said.startswith(f"trackmdp evaluate: {part}: cut off")
-    assert main(said.split("`")[1].split()[1:]) == 0
+    assert main(shlex.split(said.split("`")[1])[1:]) == 0
     assert "30 episodes" in capsys.readouterr().out
 
 

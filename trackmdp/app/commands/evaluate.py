@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -183,7 +184,7 @@ def _log(
         whole = log.close()
     except KeyboardInterrupt:
         log.abandon()
-        line = f"trackmdp replay file={log.part} recover=true"
+        line = f"trackmdp replay {shlex.quote(f'file={log.part}')} recover=true"
         _tell(f"{log.part}: cut off; `{line}` saves its episodes")
         raise
     if whole:
