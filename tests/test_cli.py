@@ -18,6 +18,7 @@ import pytest
 from tests.config.cases import composed
 from tests.typed import ENVIRONMENT, ROOT, refused, stub, typed
 from trackmdp.app.cli import COMMANDS, main
+from trackmdp.app.sweep.plan import sweep_name
 from trackmdp.config import GROUPS, ROOTS, options
 from trackmdp.errors import Preempted, RunError, UserError
 from trackmdp.solvers import optimal
@@ -281,6 +282,14 @@ def test_a_sweep_with_a_wrong_type_or_choice_starts_nothing(
     )
 
 
+def test_a_config_is_shown_resolved_with_the_folder_of_its_sweep(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = ["kernel.support_size=3"]
+    assert main(["train", *words, "--cfg", "hydra", "--resolve", "-p", "hydra.sweep.dir"]) == 0
+    assert capsys.readouterr().out.strip() == f"multirun/{sweep_name('train', words, [])}"
+
+
 def test_what_a_terminal_would_obey_is_spelled_out(capsys: pytest.CaptureFixture[str]) -> None:
     assert "\\x1b[31mred" in refused(capsys, "evaluate", "run='\x1b[31mred'")
 
@@ -312,6 +321,7 @@ module = types.ModuleType("trackmdp.app.commands.train")
 module.run = lambda *_: threading.Event().wait(60)
 sys.modules[module.__name__] = module
 from trackmdp.app.cli import main
+from trackmdp.app.sweep.plan import sweep_name
 sys.exit(main(["train"]))
 """
     process = subprocess.Popen(

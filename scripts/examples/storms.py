@@ -38,6 +38,8 @@ def gridded(file: Path, out: Path) -> tuple[int, int]:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
     with tempfile.TemporaryDirectory() as folder:
         cells = Path(folder) / "storms.csv"
         size = gridded(Path(sys.argv[1]), cells)

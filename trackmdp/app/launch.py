@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -112,7 +112,7 @@ def _run_in_hydra(cfg: DictConfig, ready: Prepared) -> None:
 
 
 def _sweep(compose: Composer) -> int:
-    from trackmdp.app.sweep.plan import Job, plan, sweep_name
+    from trackmdp.app.sweep.plan import Job, plan
     from trackmdp.app.sweep.sweep import sweep
     from trackmdp.training.display import make_console
 
@@ -121,12 +121,7 @@ def _sweep(compose: Composer) -> int:
     # Now, so that a missing package is reported before anything is planned or written.
     sweeper = _plugin("sweeper", cfg.hydra.sweeper)
     launcher = _plugin("launcher", cfg.hydra.launcher)
-    grids = getattr(sweeper, "blocks", [sweeper.name]) or []
-    # `hydra.sweep.dir` is `${sweep_name:}`, which is resolved in the next line: the same words find the same folder
-    # again, and with it the runs that are done. Hydra's own time stamp would begin anew each time.
-    OmegaConf.register_new_resolver(
-        "sweep_name", lambda: sweep_name(command, words, grids), replace=True
-    )
+    _register_name(command, words, lambda: sweeper)
     folder = folder_of(cfg, "hydra.sweep.dir")
     # Absolute: runs start in processes, perhaps on other machines, with another current folder.
     place = folder.absolute()
@@ -144,6 +139,22 @@ def _sweep(compose: Composer) -> int:
         return sweep(place, command, line, batches, launch_jobs, console)
     finally:
         remove_if_empty(made)
+
+
+def _register_name(command: str, words: Sequence[str], sweeper: Callable[[], Any]) -> None:
+    """Have `${sweep_name:}` resolved, of which `hydra.sweep.dir` is made.
+
+    The same words find the same folder again, and with it the runs that are done. Hydra's own time stamp would begin
+    anew each time.
+    """
+
+    def name() -> str:
+        from trackmdp.app.sweep.plan import sweep_name
+
+        found = sweeper()
+        return sweep_name(command, words, getattr(found, "blocks", [found.name]) or [])
+
+    OmegaConf.register_new_resolver("sweep_name", name, replace=True)
 
 
 def _of_all_runs(compose: Composer) -> Any:
@@ -212,6 +223,8 @@ def answer(compose: Composer, args: argparse.Namespace) -> bool:
     assert hydra is not None
     if args.cfg or args.info:
         cfg = compose(compose.words)
+        sweeper = partial(_plugin, "sweeper", cfg.hydra.sweeper)
+        _register_name(compose.command, run_words(compose.words), sweeper)
         if args.package not in (None, "_global_") and OmegaConf.select(cfg, args.package) is None:
             raise UserError(f"--package {args.package}: not in the config")
     try:
