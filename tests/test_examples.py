@@ -217,10 +217,10 @@ def test_storms_are_gridded_from_the_columns_of_ibtracs(tmp_path: Path) -> None:
         line.split()[0]: numbers(line)[0]
         for line in run(str(EXAMPLES / "storms.py"), str(tmp_path / "fixes.csv"))
     }
+    assert known["displacement"] > known["cell"] + 0.1
 
 
 def test_storms_without_a_file_say_what_is_expected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["storms.py"])
     with pytest.raises(SystemExit, match="FILE is a CSV"):
         runpy.run_path(str(EXAMPLES / "storms.py"), run_name="__main__")
-    assert known["displacement"] > known["cell"] + 0.1
