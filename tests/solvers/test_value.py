@@ -14,7 +14,7 @@ from tests.solvers.test_pairs import random_policy
 from tests.solvers.worlds import REFERENCES, reference_world
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import bounds, rules, value
+from trackmdp.solvers import bounds, linear, rules
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
 from trackmdp.solvers.linear import expected_steps
@@ -155,7 +155,7 @@ def test_large_systems_of_keys_are_iterated_to_the_same_value(
     world = headings(3, memory="displacement")
     policy = random_policy(world, 1)
     exact, visits = evaluate(world, policy), key_visits(world, policy)
-    monkeypatch.setattr(value, "KEYED_DIRECT", 0)
+    monkeypatch.setattr(linear, "KEYED_DIRECT", 0)
     iterated = evaluate(world, policy)
     assert exact.error == 0 < iterated.error < 1e-9
     assert np.abs(iterated.value - exact.value).max() <= iterated.error

@@ -14,7 +14,6 @@ All arrays are columns `[E, C]` and `[G, C]`: C candidates are worked on at once
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -29,76 +28,6 @@ TIE = 1e-12
 """Relative slack of a threshold: gains equal to a price but for rounding count as equal to it."""
 
 
-@dataclass(frozen=True, eq=False)
-class Decisions(ABC):
-    """Decisions of one step.
-
-    Attributes:
-        rows, sensors: `[G]`, row and sensor of each decision, in order.
-        count: K, rows.
-    """
-
-    rows: IndexArray
-    sensors: IndexArray
-    count: int
-
-    @property
-    def allowed(self) -> BoolArray | None:
-        """`[G, 1]`, the decisions that may be on; None: all."""
-        return None
-
-    @abstractmethod
-    def gained(self, gain: Array) -> Array:
-        """`[G, C]`, sums of `gain` `[E, C]` over the entries of each sensor, times its probability of a report."""
-
-    @abstractmethod
-    def part(self, kept: IndexArray, entries: IndexArray, rows: IndexArray) -> Decisions:
-        """Some of the decisions, on some of the entries.
-
-        Args:
-            kept: `[G']` decisions, all those of some rows.
-            entries: `[E']` entries of the same rows, in order.
-            rows: these rows, which become 0, 1, ...
-        """
-
-    @abstractmethod
-    def report(self, on: AnyArray) -> AnyArray:
-        """`[E, C]` probability that the set `on` `[G, C]` reports a target there; bool where no sensor misses.
-
-        Or `on` `[G, 1]` are the probabilities with which the sensors are on, each independently of the others.
-        """
-
-    @abstractmethod
-    def slope(self, gain: Array, on: Array) -> Array:
-        """`[G, 1]` derivatives of the sum of `gain` `[E, 1]` times `report` by the probabilities `on` `[G, 1]`."""
-
-    @abstractmethod
-    def best(
-        self, gain: Array, price: Array, on: BoolArray | None = None, *, exact: bool = False
-    ) -> BoolArray:
-        """`[G, C]` the set that gains most, where seeing each entry is worth `gain` `[E, C]`.
-
-        Args:
-            gain: of seeing a target there, weighted by its mass.
-            price: `[G, C]`, of each decision.
-            on: `[G, C]` a set that the one found is no worse than.
-            exact: whether shared sensors are chosen by linear and integer programs, not by greedy and add-drop.
-        """
-
-    @abstractmethod
-    def upper(self, gain: Array, price: Array) -> Array:
-        """`[K]`, proved: no set of a row gains more, of `gain` `[E]` and prices `[G]`."""
-
-    @abstractmethod
-    def margin(self, on: BoolArray, gain: Array, price: Array) -> Array:
-        """`[G]` distance of each decision from its threshold, relative to its price; inf where none can be."""
-
-
-def priced(decisions: Decisions, task: Task, inside: Array) -> Array:
-    """`[G, C]` expected prices: a sensor is paid with the probability `inside` `[K, C]` of the target in the grid."""
-    return task.prices[decisions.sensors, None] * inside[decisions.rows]
-
-
 def largest(rows: IndexArray, net: Array, count: int) -> BoolArray:
     """`[G, C]`, the `count` decisions of each row with the largest `net` `[G, C]`, of equal ones the first."""
     order = np.argsort(-net, axis=0, kind="stable")
@@ -110,28 +39,28 @@ def largest(rows: IndexArray, net: Array, count: int) -> BoolArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Own(Decisions):
+class Own:
     """Each entry is seen by the sensor of its own cell.
 
     Two entries of one plan and one cell, with different modes, are decided together. Example: a target that may be in
     cell 5 with heading 0 or 1, or in cell 6, has three entries, the decisions 0 0 1 and the sensors 5 6.
 
     Attributes:
+        rows, sensors: `[G]`, row and sensor of each decision, in order.
+        count: K, rows.
         group: `[E]` the decision about each entry; None: entry e is decided by decision e.
         chance: `[E, 1]` p_d there; None: 1 everywhere.
-        possible: `[G, 1]`, which sensors exist and lie in the window; None: all.
+        allowed: `[G, 1]`, the decisions that may be on: which sensors exist and lie in the window; None: all.
         budget: sensors that may be on in a row; None: all.
     """
 
+    rows: IndexArray
+    sensors: IndexArray
+    count: int
     group: IndexArray | None
     chance: Array | None
-    possible: BoolArray | None
+    allowed: BoolArray | None
     budget: int | None
-
-    @property
-    def allowed(self) -> BoolArray | None:
-        """See `Decisions`."""
-        return self.possible
 
     @classmethod
     def of(
@@ -153,8 +82,8 @@ class Own(Decisions):
                 codes, group = np.unique(codes, return_inverse=True)
                 rows, cells = np.divmod(codes, task.num_cells)
         allowed = task.choosable(None if located is None else located[rows], cells)
-        possible = None if allowed is None else allowed[:, None]
-        return cls(rows, cells, count, group, chance, possible, task.budget)
+        allowed = None if allowed is None else allowed[:, None]
+        return cls(rows, cells, count, group, chance, allowed, task.budget)
 
     def within(self, on: BoolArray, net: Array) -> BoolArray:
         """`[G, C]`, of the sets `on` as many sensors as the budget allows, those of the largest `net` `[G, C]`."""
@@ -162,16 +91,25 @@ class Own(Decisions):
         return on & largest(self.rows, np.where(on, net, -np.inf), self.budget)
 
     def report(self, on: AnyArray) -> AnyArray:
-        """See `Decisions`."""
+        """`[E, C]` probability that the set `on` `[G, C]` reports a target there; bool where no sensor misses.
+
+        Or `on` `[G, 1]` are the probabilities with which the sensors are on, each independently of the others.
+        """
         there = on if self.group is None else on[self.group]
         return there if self.chance is None else there * self.chance
 
     def slope(self, gain: Array, on: Array) -> Array:  # noqa: ARG002
-        """See `Decisions`."""
+        """`[G, 1]` derivatives of the sum of `gain` `[E, 1]` times `report` by the probabilities `on` `[G, 1]`."""
         return self.gained(gain)
 
     def part(self, kept: IndexArray, entries: IndexArray, rows: IndexArray) -> Own:
-        """See `Decisions`."""
+        """Some of the decisions, on some of the entries.
+
+        Args:
+            kept: `[G']` decisions, all those of some rows.
+            entries: `[E']` entries of the same rows, in order.
+            rows: these rows, which become 0, 1, ...
+        """
         group = self.group
         return Own(
             np.searchsorted(rows, self.rows[kept]),
@@ -184,7 +122,7 @@ class Own(Decisions):
         )
 
     def gained(self, gain: Array) -> Array:
-        """See `Decisions`."""
+        """`[G, C]`, sums of `gain` `[E, C]` over the entries of each sensor, times its probability of a report."""
         gain = gain if self.chance is None else gain * self.chance
         return gain if self.group is None else self._sums @ gain
 
@@ -201,15 +139,22 @@ class Own(Decisions):
         *,
         exact: bool = False,  # noqa: ARG002
     ) -> BoolArray:
-        """See `Decisions`."""
+        """`[G, C]` the set that gains most, where seeing each entry is worth `gain` `[E, C]`.
+
+        Args:
+            gain: of seeing a target there, weighted by its mass.
+            price: `[G, C]`, of each decision.
+            on: `[G, C]` a set that the one found is no worse than.
+            exact: whether shared sensors are chosen by linear and integer programs, not by greedy and add-drop.
+        """
         # Strict: an entry without mass is never sensed, not even by a sensor that costs nothing.
         gained = self.gained(gain)
         chosen: BoolArray = gained > price
         chosen = chosen if self.allowed is None else chosen & self.allowed
         return chosen if self.budget is None else self.within(chosen, gained - price)
 
-    def upper(self, gain: Array, price: Array) -> Array:
-        """See `Decisions`."""
+    def upper(self, gain: Array, price: Array, *, exact: bool = True) -> Array:  # noqa: ARG002
+        """`[K]`, proved: no set of a row gains more, of `gain` `[E]` and prices `[G]`; tighter if `exact`."""
         net = np.maximum(self.gained(gain[:, None])[:, 0] - price, 0.0)
         net = net if self.allowed is None else net * self.allowed[:, 0]
         if self.budget is not None:
@@ -217,7 +162,7 @@ class Own(Decisions):
         return per_row(self.rows, net, self.count)
 
     def margin(self, on: BoolArray, gain: Array, price: Array) -> Array:  # noqa: ARG002
-        """See `Decisions`."""
+        """`[G]` distance of each decision from its threshold, relative to its price; inf where none can be."""
         gained = self.gained(gain)
         far = np.full_like(gained, np.inf)
         # Free sensors come last: no price would make them nearly worth leaving out.

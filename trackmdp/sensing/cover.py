@@ -29,7 +29,7 @@ from scipy import sparse
 from trackmdp.arrays.entries import per_row, ranks, row_index, summing, with_data
 from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
-from trackmdp.sensing.choose import TIE, Decisions
+from trackmdp.sensing.choose import TIE
 from trackmdp.sensing.task import Task
 
 _PROVED = 1e-9
@@ -60,14 +60,21 @@ class Cover:
 
 
 @dataclass(frozen=True, eq=False)
-class Shared(Decisions):
-    """Decisions about sensors that share entries.
+class Shared:
+    """Decisions about sensors that share entries; methods are those of `Own`.
 
     Attributes:
+        rows, sensors: `[G]`, row and sensor of each decision, in order.
+        count: K, rows.
         sees: `[G, E]` CSR, probability that the sensor of a decision reports an entry of its row.
     """
 
+    rows: IndexArray
+    sensors: IndexArray
+    count: int
     sees: sparse.csr_array
+
+    allowed = budget = None
 
     @classmethod
     def of(
@@ -123,7 +130,7 @@ class Shared(Decisions):
         return np.exp(self._logs @ on.astype(np.float64))
 
     def report(self, on: AnyArray) -> AnyArray:
-        """See `Decisions`."""
+        """See `Own`."""
         if on.dtype != np.bool_:
             return 1.0 - self._missed(on)[0][:, None]
         if self.perfect:
@@ -132,7 +139,7 @@ class Shared(Decisions):
         return np.where(left < 1e-15, 1.0, 1.0 - left)
 
     def slope(self, gain: Array, on: Array) -> Array:
-        """See `Decisions`."""
+        """See `Own`."""
         # d/dq_s of 1 - prod (1 - p_s q_s) is p_s times the product over the others.
         missed, alone = self._missed(on)
         others = missed[self.sees.indices] / alone
@@ -144,7 +151,7 @@ class Shared(Decisions):
         return np.exp(with_data(self.sees, np.log(alone)).sum(axis=0)), alone
 
     def gained(self, gain: Array) -> Array:
-        """See `Decisions`."""
+        """See `Own`."""
         return self.sees @ gain
 
     def worth(self, on: BoolArray, gain: Array, price: Array) -> Array:
@@ -162,12 +169,12 @@ class Shared(Decisions):
         left = gain * self._unreported(on)
         return np.where(on, price - self._odds @ left, self.sees @ left - price)
 
-    def upper(self, gain: Array, price: Array) -> Array:
-        """See `Decisions`; by integer programs where no sensor misses."""
-        return self.cover(gain, price, exact=True).upper
+    def upper(self, gain: Array, price: Array, *, exact: bool = True) -> Array:
+        """See `Own`; if `exact`, by integer programs where no sensor misses."""
+        return self.cover(gain, price, exact=exact).upper
 
     def margin(self, on: BoolArray, gain: Array, price: Array) -> Array:
-        """See `Decisions`."""
+        """See `Own`."""
         change = np.abs(self.changes(on, gain, price))
         far = np.full_like(change, np.inf)
         return np.divide(change, price, out=far, where=price > 0)[:, 0]
@@ -175,7 +182,7 @@ class Shared(Decisions):
     def best(
         self, gain: Array, price: Array, on: BoolArray | None = None, *, exact: bool = False
     ) -> BoolArray:
-        """See `Decisions`; found by adding and dropping one sensor at a time, from `on`, from none and from all."""
+        """See `Own`; found by adding and dropping one sensor at a time, from `on`, from none and from all."""
         price = np.broadcast_to(price, (len(self.rows), gain.shape[1]))
         if exact:
             columns = zip(gain.T, price.T, strict=True)
@@ -235,7 +242,7 @@ class Shared(Decisions):
         return Shared(self.rows[kept], self.sensors[kept], self.count, self.sees[kept])
 
     def part(self, kept: IndexArray, entries: IndexArray, rows: IndexArray) -> Shared:
-        """See `Decisions`."""
+        """See `Own`."""
         place = np.searchsorted(rows, self.rows[kept])
         sees = self.sees[kept][:, entries]
         return Shared(place, self.sensors[kept], len(rows), sees)

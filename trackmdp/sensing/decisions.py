@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 from trackmdp.arrays.types import IndexArray
-from trackmdp.sensing.choose import Decisions, Own
+from trackmdp.sensing.choose import Own
 from trackmdp.sensing.cover import Shared
 from trackmdp.sensing.task import Task
+
+Decisions: TypeAlias = Own | Shared
+"""Decisions of one step."""
 
 
 def sensing(

@@ -6,6 +6,7 @@ They hold for every memory. With one mode the state is the cell.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -14,9 +15,9 @@ from scipy import sparse
 
 from trackmdp.arrays.entries import per_row, row_index, with_data
 from trackmdp.arrays.types import AnyArray, Array, BoolArray
-from trackmdp.sensing.choose import Decisions, Own, priced
+from trackmdp.sensing.choose import Own
 from trackmdp.sensing.cover import Shared
-from trackmdp.sensing.decisions import sensing
+from trackmdp.sensing.decisions import Decisions, sensing
 from trackmdp.solvers.linear import (
     RenewalSystem,
     accumulate,
@@ -62,21 +63,36 @@ def valid(world: World) -> Array:
     Each step is worth the best free choice or, where D is less than that choice, the safe action; a window, which
     only takes choices away, is left out of account here and in `clocked`.
     """
-    return of_cells(world, valid_states(world))
-
-
-def valid_states(world: World) -> Array:
-    """`[Z]` of `valid`."""
-    if world.max_steps is not None:
-        return _truncated_valid(world, world.max_steps)
-    return accumulate(world.kernel, _best_step(world), grid_of(world))
+    best = _best_step(world)
+    if world.max_steps is None:
+        return of_cells(world, accumulate(world.kernel, best, grid_of(world)))
+    return of_cells(
+        world, _cut(world, np.zeros(len(best)), lambda later: best + world.kernel @ later)
+    )
 
 
 def clocked(world: World) -> Array:
-    """`[M]` the clocked bound U(x, 0): V* <= U <= `valid`."""
-    if world.max_steps is not None:
-        return of_cells(world, _truncated_clocked(world, world.max_steps))
-    return of_cells(world, clocked_table(world).value)
+    """`[M]` the clocked bound U(x, 0): V* <= U <= `valid`.
+
+    On episodes that are cut, the optimum over policies that may also depend on the steps left, so a bound for all other
+    policies as well.
+    """
+    if world.max_steps is None:
+        return of_cells(world, clocked_table(world).value)
+    nothing = np.zeros((world.num_states, world.num_choices + 1))
+    return of_cells(world, _cut(world, nothing, lambda later: _one_step(world, later))[:, 0])
+
+
+def _cut(world: World, value: Array, step: Callable[[Array], Array]) -> Array:
+    """`value` after `max_steps` times `step`, which adds one more step in front; or no less than that."""
+    most = world.max_steps or 0
+    for h in range(1, most + 1):
+        before, value = value, step(value)
+        change, largest = (float(np.abs(each).max()) for each in (value - before, value))
+        more = still_to_come(world, change, largest, most - h)
+        if more is not None:
+            return value + more
+    return value
 
 
 def of_cells(world: World, value: Array) -> Array:
@@ -118,16 +134,13 @@ def _moves(world: World) -> Decisions:
 
 def _free(world: World, gain: Array, charge: Array, *, exact: bool = False) -> Array:
     """`[Z]` the most that one free choice gains, of `gain` `[E]` for each move and prices times `charge` `[Z]`."""
+    return _moves(world).upper(gain, _priced(world, charge), exact=exact)
+
+
+def _priced(world: World, charge: Array) -> Array:
+    """`[G]` expected prices of the sensors that may report, each paid with the probability `charge` `[Z]`."""
     moves = _moves(world)
-    price = priced(moves, world, charge[:, None])[:, 0]
-    if isinstance(moves, Shared):
-        return moves.cover(gain, price, exact=exact).upper
-    return moves.upper(gain, price)
-
-
-def _sums(moves: Decisions, values: Array, count: int) -> Array:
-    """`[Z, C]` sums of `values` `[G, C]` over the decisions of each state."""
-    return np.stack([per_row(moves.rows, each, count) for each in values.T], axis=1)
+    return world.prices[moves.sensors] * charge[moves.rows]
 
 
 def one_set(world: World, detected: Array, missed: Array) -> Array:
@@ -203,15 +216,17 @@ def _clocked(world: World, *, exact: bool) -> ClockedBound:
         choices, table = improved, candidate
     # Iterated solves leave Û off by a little, and so do linear programs; with rho the excess of one improvement step
     # over Û, and at most `longest` steps to collect it on, U <= Û + longest * rho (theory.md#bounds).
-    sure = solved and world.coverage is None
-    error = 0.0 if sure else float(expected_steps(world).max()) * _excess(world, table, exact=exact)
+    error = 0.0
+    if not (solved and world.coverage is None):
+        excess = float((_one_step(world, table, exact=exact) - table).max())
+        error = float(expected_steps(world).max()) * max(excess, 0.0)
     return ClockedBound(table, error)
 
 
 def _chosen(world: World, on: Array | BoolArray, report: Array | BoolArray) -> _Choices:
-    moves = _moves(world)
-    price = priced(moves, world, world.stay_probability[:, None])
-    return _Choices(on, report, _sums(moves, on * price, world.num_states))
+    rows, paid = _moves(world).rows, on * _priced(world, world.stay_probability)[:, None]
+    sums = [per_row(rows, each, world.num_states) for each in paid.T]
+    return _Choices(on, report, np.stack(sums, axis=1))
 
 
 def _all_on(world: World) -> _Choices:
@@ -232,7 +247,7 @@ def _reports_worth(world: World, table: Array, n: int) -> Array:
 def _improved(world: World, table: Array, choices: _Choices, *, exact: bool) -> _Choices:
     """The best choices, one step ahead; a tie leaves the present one."""
     moves, free = _moves(world), range(world.num_choices)
-    price = priced(moves, world, world.stay_probability[:, None])
+    price = _priced(world, world.stay_probability)[:, None]
     if isinstance(moves, Shared):
         found = [
             moves.cover(_reports_worth(world, table, n), price[:, 0], exact=exact) for n in free
@@ -241,7 +256,6 @@ def _improved(world: World, table: Array, choices: _Choices, *, exact: bool) -> 
             np.stack([getattr(each, name) for each in found], axis=1) for name in ("on", "seen")
         )
         return _chosen(world, on, seen)
-    assert isinstance(moves, Own)
     # Both sides of the comparison are multiplied by the probability p of the move; a target missed by a sensor that is
     # on is worth p (1 - p_d) U(j, n + 1) on both: it is on iff p p_d (r + U(j, 0) - U(j, n + 1)) > c p_in.
     on = np.zeros(choices.on.shape, dtype=bool)
@@ -257,30 +271,18 @@ def _improved(world: World, table: Array, choices: _Choices, *, exact: bool) -> 
     return _chosen(world, on, moves.report(on))
 
 
-def _best_choices(world: World, table: Array, *, exact: bool = False) -> Array:
-    """`[Z, t_max + 1]`, the best choice and then `table`; with footprints no less than that."""
-    best: Array = world.kernel @ table[:, 1:]
+def _one_step(world: World, table: Array, *, exact: bool = False) -> Array:
+    """`[Z, t_max + 2]`, the best choice or, last, the safe action, then `table`; with footprints no less than that."""
+    # n = t_max + 1: r - D, and located again, whose clock is 0; or missed, and the safe action again.
+    safe = world.reward - world.safe_cost + table[:, 0]
+    if not world.safe:
+        missed = 1.0 - world.safe_detection[world.motion.cell]
+        safe = safe - missed * (world.reward + table[:, 0] - table[:, -1])
+    best: Array = world.kernel @ np.column_stack([table[:, 1:], safe])
     for n in range(world.num_choices):
         worth = _reports_worth(world, table, n)
         best[:, n] += _free(world, worth, world.stay_probability, exact=exact)
     return best
-
-
-def _excess(world: World, table: Array, *, exact: bool) -> float:
-    """The most by which the best choices, one step ahead, exceed `table`."""
-    # The last column has no choice: the safe action is forced.
-    last = world.kernel @ _after_safe_action(world, table)
-    best = np.column_stack([_best_choices(world, table, exact=exact), last])
-    return max(float((best - table).max()), 0.0)
-
-
-def _after_safe_action(world: World, table: Array) -> Array:
-    """`[Z]` worth of the target in each state when the safe action has been carried out, its price included."""
-    located = world.reward - world.safe_cost + table[:, 0]
-    if world.safe:
-        return located
-    missed = 1.0 - world.safe_detection[world.motion.cell]
-    return located - missed * (world.reward + table[:, 0] - table[:, -1])
 
 
 def _value(world: World, choices: _Choices, guess: Array | None = None) -> tuple[Array, bool]:
@@ -321,37 +323,3 @@ def _masked(moves: sparse.csr_array, keep: AnyArray) -> sparse.csr_array:
     kept = with_data(moves, moves.data * keep).copy()
     kept.eliminate_zeros()
     return kept
-
-
-def _truncated_valid(world: World, max_steps: int) -> Array:
-    """`[Z]` the valid bound on episodes of at most `max_steps` steps."""
-    best, value = _best_step(world), np.zeros(world.num_states)
-    for h in range(1, max_steps + 1):
-        before, value = value, best + world.kernel @ value
-        more = _more(world, before, value, max_steps - h)
-        if more is not None:
-            return value + more
-    return value
-
-
-def _more(world: World, before: Array, value: Array, left: int) -> float | None:
-    """See `still_to_come`."""
-    change = float(np.abs(value - before).max())
-    return still_to_come(world, change, float(np.abs(value).max()), left)
-
-
-def _truncated_clocked(world: World, max_steps: int) -> Array:
-    """`[Z]` the clocked bound on episodes of at most `max_steps` steps.
-
-    The optimum over policies that may also depend on the steps left, so a bound for all other policies as well.
-    """
-    # U_h(z, n) with h steps left, from U_0 = 0: each round adds one step in front.
-    table = np.zeros((world.num_states, world.num_choices + 1))
-    for h in range(1, max_steps + 1):
-        # n = t_max + 1: r - D, and located again, whose clock is 0; or missed, and the safe action again.
-        forced = world.kernel @ _after_safe_action(world, table)
-        before, table = table, np.column_stack([_best_choices(world, table), forced])
-        more = _more(world, before, table, max_steps - h)
-        if more is not None:
-            return table[:, 0] + more
-    return table[:, 0]

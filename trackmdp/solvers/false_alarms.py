@@ -54,10 +54,9 @@ def believed(problem: Problem, policy: PolicyTable, false_alarm: float) -> Evalu
         onward, gathered = onward + found.located, gathered + found.totals
     last = passed(world, walk.move(), mass, 1.0, world.safe_cost, 0.0, m * m)[0]
     system = RenewalSystem(onward + last.located, world.size, direct=_DIRECT)
-    totals = system.solve(gathered + last.totals)
-    # As in `value`: no more reports than steps, which the longest episode bounds.
-    left = system.residual(gathered + last.totals, totals)
-    error = 0.0 if system.exact else float(np.abs(left).max() * totals[:, 5].max())
+    gathered += last.totals
+    totals = system.solve(gathered)
+    error = system.error(gathered, totals, float(totals[:, 5].max()))
     return pooled(totals[:: m + 1].T, error)  # episodes begin believed where they are
 
 

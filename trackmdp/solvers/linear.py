@@ -27,6 +27,10 @@ from trackmdp.world.model import World
 DIRECT_CELLS = 20_000
 """Cells up to which systems are factorised. The factors of a grid fill about M^1.4 entries: 75 a cell at M = 16,384."""
 
+KEYED_DIRECT = 700
+"""Events of several keys or modes a cell up to which their system is factorised, as a full matrix: each leads to all
+cells in reach."""
+
 # Cells up to which a full matrix is factorised, in a quarter of the time: beliefs that spread leave few zeros.
 FULL = 200
 # Side of the square blocks that are one cell of the next coarser level, and cells at which a level is factorised.
@@ -59,8 +63,7 @@ class RenewalSystem:
         transition: `[M, M]` sub-stochastic; or `[KM, KM]` of K states per cell, cell j in its k-th state being kM + j.
         size: (rows, columns) of the grid, or `[B]` a group of each of B states that are no cells, at most
             `_COARSEST` groups: they take the place of a coarser grid.
-        direct: states up to which a factorisation is used.
-        full: states up to which the factorised matrix is a full one.
+        direct: cells of a grid up to which a factorisation is used; of other states it is `KEYED_DIRECT`.
         tolerance: residual at which an iteration ends, relative to the size of right-hand side and solution.
 
     Attributes:
@@ -76,15 +79,15 @@ class RenewalSystem:
         size: tuple[int, int] | IndexArray | None = None,
         *,
         direct: int = DIRECT_CELLS,
-        full: int = FULL,
         tolerance: float = TOLERANCE,
     ) -> None:
         # I - T is an M-matrix with a dominant diagonal: its inverse is non-negative, and no pivoting is needed.
         self._system = short_indices(
             sparse.eye_array(transition.shape[0], format="csr") - transition
         )
-        self.exact = transition.shape[0] <= direct
-        self._size, self._tolerance, self._full = size, tolerance, full
+        keyed = size is not None and not isinstance(size, tuple)
+        self._size, self._tolerance, self._full = size, tolerance, KEYED_DIRECT if keyed else FULL
+        self.exact = transition.shape[0] <= (KEYED_DIRECT if keyed else direct)
         if self.exact:
             return
         diagonal = self._system.diagonal()
@@ -149,26 +152,24 @@ class RenewalSystem:
             other._precondition = _Level(other._system, self._size)
         return other
 
-    def residual(self, gathered: Array, solution: Array, *, transposed: bool = False) -> Array:
-        """`[M]` or `[M, K]`, gathered - (I - transition) solution, or with the transposed matrix."""
-        return gathered - (self._turned if transposed else self)._system @ solution
+    def residual(self, gathered: Array, solution: Array) -> Array:
+        """`[M]` or `[M, K]`, gathered - (I - transition) solution."""
+        return gathered - self._system @ solution
 
     def passed_on(self, mass: Array) -> Array:
         """`[M]`, mass transition: where mass in the states is after one transition."""
         return mass - mass @ self._system
 
-    def upper(self, gathered: Array, longest: float) -> Array:
-        """`[M]` no less than the solution for any residual; `longest` bounds the steps of an episode.
+    def error(self, gathered: Array, solution: Array, longest: float) -> float:
+        """No entry of a `solution` is farther from the exact one; 0 where the system was factorised.
 
         With e = v - v̂ = (I - T)^-1 (residual of v̂) and (I - T)^-1 >= 0, with row sums of at most the expected number
-        of renewals, |e| <= longest · max |residual|.
+        of renewals, |e| <= longest · max |residual|; an episode has no more renewals than its steps, which `longest`
+        bounds.
         """
-        solution = self.solve(gathered)
-        return (
-            solution
-            if self.exact
-            else solution + longest * float(np.abs(self.residual(gathered, solution)).max())
-        )
+        if self.exact:
+            return 0.0
+        return longest * float(np.abs(self.residual(gathered, solution)).max())
 
     def _iterate(self, gathered: Array, start: Array) -> Array:
         """BiCGSTAB, started anew while that makes the true residual (the recursive one drifts off) much smaller."""

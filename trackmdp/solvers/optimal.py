@@ -354,7 +354,9 @@ class _Run:
     def pay(self, paid: Array) -> None:
         """Use a proof that `paid` `[M]`, the e of the module's text, pays for every plan over the policy at hand."""
         # The clocked bound and all that earlier rounds proved hold as well: the least of them is kept, cell by cell.
-        self.bound = np.minimum(self.bound, self.value + self.paths.upper(paid, self.longest))
+        more = self.paths.solve(paid)
+        more = more + self.paths.error(paid, more, self.longest)
+        self.bound = np.minimum(self.bound, self.value + more)
 
     def solution(self, interrupted: bool) -> Solution:
         bound = of_cells(self.world, np.maximum(self.bound, self.value))

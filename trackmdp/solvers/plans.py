@@ -20,7 +20,7 @@ from scipy import sparse
 
 from trackmdp.arrays.entries import summing
 from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
-from trackmdp.sensing.choose import Decisions
+from trackmdp.sensing.decisions import Decisions
 
 
 @dataclass(frozen=True, eq=False)

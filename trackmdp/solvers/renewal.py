@@ -19,18 +19,11 @@ from trackmdp.machine import check_free
 from trackmdp.memory.keys import KeySpace
 from trackmdp.motion.chain import Motion
 from trackmdp.policies.table import PolicyTable
-from trackmdp.sensing.choose import Decisions
-from trackmdp.sensing.decisions import sensing
+from trackmdp.sensing.decisions import Decisions, sensing
 from trackmdp.sensing.task import Task
 from trackmdp.solvers.linear import DIRECT_CELLS, TOLERANCE, RenewalSystem
 from trackmdp.solvers.plans import Layout, Plans, Turn
-from trackmdp.solvers.value import (
-    event_groups,
-    event_system,
-    first_events,
-    solved,
-    whole_renewals,
-)
+from trackmdp.solvers.value import event_groups, first_events, whole_renewals
 from trackmdp.solvers.walk import Events, Passed, Step, Walk, all_events, passed
 from trackmdp.world.model import World
 
@@ -153,12 +146,13 @@ class Renewal:
         located, gathered = whole_renewals(self.passes(self.acts(sets)), self.count)
         direct = _DIRECT if guessed else DIRECT_CELLS
         tolerance = TOLERANCE if self.single else _SEARCHED
-        return event_system(located, self.groups, direct, tolerance), gathered[:, 0]
+        system = RenewalSystem(located, self.groups, direct=direct, tolerance=tolerance)
+        return system, gathered[:, 0]
 
     def value(self, sets: Sequence[BoolArray], guess: Array | None = None) -> Array:
         """`[B]` V of a policy; `guess` is where an iteration begins."""
         system, earned = self.system(sets, guessed=guess is not None)
-        return solved(system, earned, guess)[0]
+        return system.solve(earned, guess)
 
     def mean(self, value: Array) -> float:
         """The AIHTR of a `value` `[B]`."""

@@ -25,7 +25,7 @@ from trackmdp.recordings.tracks import ends_of
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.plans import Layout, Plans
 from trackmdp.solvers.renewal import Renewal
-from trackmdp.solvers.value import solved, visits_of
+from trackmdp.solvers.value import visits_of
 from trackmdp.world.model import World
 
 _TOGETHER = 1_500
@@ -76,7 +76,7 @@ class Found:
     @cached_property
     def value(self) -> Array:
         """`[B]`."""
-        return solved(self.system, self._earned, self._guess)[0]
+        return self.system.solve(self._earned, self._guess)
 
     @property
     def rounding(self) -> float:

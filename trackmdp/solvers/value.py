@@ -12,7 +12,7 @@ becomes a backward recursion over them. Nothing diverges where the target never 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import sparse
@@ -27,7 +27,6 @@ from trackmdp.sensing.task import Task
 from trackmdp.solvers.evaluation import Evaluation, ReplayedTracks, by_start, pooled
 from trackmdp.solvers.linear import (
     DIRECT_CELLS,
-    TOLERANCE,
     Levels,
     RenewalSystem,
     accumulate,
@@ -42,14 +41,8 @@ from trackmdp.world.problem import Problem
 if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its sets
     from trackmdp.policies.policy import PolicyLike
 
-KEYED_DIRECT = 700
-"""Events of several keys or modes a cell up to which their system is factorised, as a full matrix: each leads to all
-cells in reach."""
 _MOST_GROUPS = 2_500
 """States up to which each is a group of its own: the factors of more would cost more than they spare."""
-
-Followed: TypeAlias = tuple[Events, Iterator[Passed]]
-"""Events that a policy leads to, and their steps."""
 
 
 def value_of(
@@ -83,8 +76,8 @@ def value_of(
     return _whole_episodes(problem, table, guess, per_cell)
 
 
-def follow(task: Task, motion: Motion, policy: PolicyTable) -> Followed:
-    """The renewals of a policy: only mass that it leaves undetected is followed."""
+def follow(task: Task, motion: Motion, policy: PolicyTable) -> tuple[Events, Iterator[Passed]]:
+    """The events that a policy leads to, and their steps: only mass that it leaves undetected is followed."""
     acts = policy.sensed_by(task)
     events = all_events(task, policy.task.keys, motion, acts.reports)
     return events, _steps(task, motion, events, acts)
@@ -162,10 +155,11 @@ def _whole_episodes(
     if cells_alone and len(events.codes) > DIRECT_CELLS:
         return _iterated(world, located, gathered, guess, per_cell)
     size = world.size if cells_alone else event_groups(world.motion, events.state)
-    totals, left = solved(event_system(located, size), gathered)
+    system = RenewalSystem(located, size)
+    totals = system.solve(gathered)
     check_length(totals[:, 5])
-    # |V - V̂| <= (steps of an episode) · max |residual|, as an episode has no more renewals than steps.
-    return _figures(world, events, totals, left * float(totals[:, 5].max()))
+    error = system.error(gathered, totals, float(totals[:, 5].max()))
+    return _figures(world, events, totals, error)
 
 
 def whole_renewals(steps: Iterable[Passed], count: int) -> tuple[sparse.csr_array, Array]:
@@ -190,9 +184,8 @@ def _iterated(
     system, length = RenewalSystem(located, world.size), expected_steps(world)
     # The value of a missed target is near to the value of a located one in its cell.
     value = system.solve(gathered[:, 0], None if guess is None else np.tile(guess, states // m))
-    # |V - V̂| <= max (I - T)^-1 1 · max |residual|, and an episode has no more renewals than steps
-    # (theory.md#exact-value); the steps are those of I - P, themselves iterated.
-    error = float(length.max()) * float(np.abs(system.residual(gathered[:, 0], value)).max())
+    # The steps are those of I - P, themselves iterated (theory.md#exact-value).
+    error = system.error(gathered[:, 0], value, float(length.max()))
     # Sensing does not move the target, and each episode has one exit step: the steps in the grid are all but that one.
     steps = length - 1.0
     if per_cell:
@@ -219,27 +212,6 @@ def first_events(events: Events, motion: Motion) -> IndexArray:
     return np.searchsorted(events.codes, first.astype(np.int64) * keys.num_keys + key)
 
 
-def event_system(
-    transition: sparse.csr_array,
-    size: tuple[int, int] | IndexArray,
-    direct: int = DIRECT_CELLS,
-    tolerance: float = TOLERANCE,
-) -> RenewalSystem:
-    """The linear system over events.
-
-    Args:
-        transition: `[B, B]`.
-        size: of the grid where events are its cells; else `[B]` their groups, `event_groups`.
-        direct: cells of a grid up to which it is factorised.
-        tolerance: see `RenewalSystem`.
-    """
-    if isinstance(size, tuple):
-        return RenewalSystem(transition, size, direct=direct, tolerance=tolerance)
-    return RenewalSystem(
-        transition, size, direct=KEYED_DIRECT, full=KEYED_DIRECT, tolerance=tolerance
-    )
-
-
 def event_groups(motion: Motion, states: IndexArray) -> IndexArray:
     """`[B]`, 0 to the number of groups - 1: events of one state are a group; of one cell, where states are many.
 
@@ -249,16 +221,6 @@ def event_groups(motion: Motion, states: IndexArray) -> IndexArray:
     each = states if motion.num_states <= _MOST_GROUPS else motion.cell[states]
     rank = np.cumsum(np.bincount(each) > 0) - 1
     return rank[each]
-
-
-def solved(
-    system: RenewalSystem, gathered: Array, guess: Array | None = None, *, transposed: bool = False
-) -> tuple[Array, float]:
-    """The solution of v = gathered + transition v, and its largest residual, 0 where it was factorised."""
-    found = system.solve(gathered, guess, transposed=transposed)
-    if system.exact:
-        return found, 0.0
-    return found, float(np.abs(system.residual(gathered, found, transposed=transposed)).max())
 
 
 def visits_of(system: RenewalSystem, start: Array, guess: Array | None = None) -> Array:
@@ -271,7 +233,7 @@ def visits_of(system: RenewalSystem, start: Array, guess: Array | None = None) -
         guess = start
         for _ in range(4):
             guess = start + system.passed_on(guess)
-    return solved(system, start, guess, transposed=True)[0]
+    return system.solve(start, guess, transposed=True)
 
 
 def key_visits(problem: Problem, policy: PolicyTable) -> Array:
@@ -280,7 +242,7 @@ def key_visits(problem: Problem, policy: PolicyTable) -> Array:
     events, steps = follow(problem, motion, policy)
     located, _ = whole_renewals(steps, len(events.codes))
     start = np.bincount(first_events(events, motion), minlength=len(events.codes))
-    system = event_system(located, event_groups(motion, events.state))
+    system = RenewalSystem(located, event_groups(motion, events.state))
     visits = visits_of(system, start / len(motion.first))
     known = len(events.codes) - events.forced
     return per_row(events.key[:known], visits[:known], events.keys.num_keys)

@@ -11,7 +11,7 @@ import pytest
 from trackmdp.app.cli import main
 from trackmdp.config.compose import compose
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import value
+from trackmdp.solvers import linear, value
 from trackmdp.training.devices import needs
 from trackmdp.world.make import make_problem
 from trackmdp.world.model import World
@@ -109,9 +109,9 @@ def test_large_systems_are_iterated_to_the_same_value(monkeypatch: pytest.Monkey
     policy = PolicyTable.from_dense(
         world, np.random.default_rng(0).random((world.num_keys, world.num_choices, 16)) < 0.5
     )
-    monkeypatch.setattr(value, "KEYED_DIRECT", 0)
+    monkeypatch.setattr(linear, "KEYED_DIRECT", 0)
     iterated = value.value_of(world, policy)
-    monkeypatch.setattr(value, "KEYED_DIRECT", 10**6)
+    monkeypatch.setattr(linear, "KEYED_DIRECT", 10**6)
     exact = value.value_of(world, policy)
     assert iterated.aihtr == pytest.approx(exact.aihtr, rel=1e-11)
     assert exact.error == 0

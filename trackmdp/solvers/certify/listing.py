@@ -21,7 +21,6 @@ import numpy as np
 
 from trackmdp.arrays.entries import ranks
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
-from trackmdp.sensing.choose import Own
 from trackmdp.sensing.cover import Shared
 from trackmdp.solvers.plans import Plans
 
@@ -116,8 +115,7 @@ def _of_sensors(plans: Plans) -> _Choices | None:
     """The sets of all steps but the last as bits, of which each sensor of a row has its own."""
     owners = [turn.choice.rows for turn in plans.turns[:-1]]
     numbers = list(map(ranks, owners))
-    choice = plans.turns[0].choice
-    budget = choice.budget if isinstance(choice, Own) else None
+    budget = plans.turns[0].choice.budget
     found = _all_sets(owners, numbers) if budget is None else _small_sets(numbers, budget)
     if found is None or plans.layout.count * found[0] > _MOST_PATTERNS:
         return None
@@ -127,7 +125,7 @@ def _of_sensors(plans: Plans) -> _Choices | None:
         found = []
         for t, turn in enumerate(plans.turns[:-1]):
             on = bits(t, numbers[turn.choice.rows]) & 1 > 0
-            allowed = turn.choice.allowed if isinstance(turn.choice, Own) else None
+            allowed = turn.choice.allowed
             found.append(on if allowed is None else on & allowed[:, 0])
         return found
 
