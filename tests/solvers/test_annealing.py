@@ -109,12 +109,9 @@ def test_annealed_policies_end_above_the_homotopy() -> None:
     made = make_world("heading", size=3, cost=0.296, t_max=1, memory="displacement_gap")
     world = made.but(safe_detection=0.86)
     renewal = Renewal(world, world.motion)
-    first = Found(renewal, clocked_sets(renewal, world))
-    led = exchanged(renewal, follow_credit(renewal, world, first, 12, 1))
-    found = [
-        exchanged(renewal, anneal(renewal, world, np.random.default_rng(seed))).aihtr
-        for seed in (0, 0, 1)
-    ]
+    first = Found(renewal, clocked_sets(renewal))
+    led = exchanged(follow_credit(first, 12, 1))
+    found = [exchanged(anneal(renewal, np.random.default_rng(seed))).aihtr for seed in (0, 0, 1)]
     assert found[0] == found[1] != found[2]
     assert min(found) > led.aihtr * 1.005
 
@@ -123,7 +120,7 @@ def test_the_lead_of_the_credit_ends_above_where_nothing_misses() -> None:
     world = make_world("heading", size=3, memory="displacement")
     renewal, rng = Renewal(world, world.motion), np.random.default_rng(0)
     plain, led = (
-        max(exchanged(renewal, anneal(renewal, world, rng, led=led)).aihtr for _ in range(3))
+        max(exchanged(anneal(renewal, rng, led=led)).aihtr for _ in range(3))
         for led in (False, True)
     )
     assert led > plain
@@ -133,7 +130,7 @@ def test_the_lead_of_the_credit_ends_above_where_nothing_misses() -> None:
 def test_limits_hold_for_annealed_policies(changes: dict[str, int]) -> None:
     world = headings(3, 0.8, cost=0.05, t_max=1, memory="displacement").but(**changes)
     renewal = Renewal(world, world.motion)
-    policy = anneal(renewal, world, np.random.default_rng(0))
+    policy = anneal(renewal, np.random.default_rng(0))
     for choice, on in zip(renewal.choices, policy.sets, strict=True):
         assert on.any()
         if "budget" in changes:
@@ -148,7 +145,7 @@ def test_temperatures_and_errors_are_in_rewards() -> None:
     world = headings(3, 0.8, cost=0.2, t_max=1, memory="displacement").but(safe_detection=0.8)
     tenfold = world.but(cost=10 * world.cost, safe_cost=10 * world.safe_cost, reward=10.0)
     one, other = (
-        anneal(Renewal(each, each.motion), each, np.random.default_rng(4), led=True)
+        anneal(Renewal(each, each.motion), np.random.default_rng(4), led=True)
         for each in (world, tenfold)
     )
     assert other.aihtr == pytest.approx(10 * one.aihtr)

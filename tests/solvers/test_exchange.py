@@ -153,16 +153,16 @@ def test_each_cell_takes_the_best_plan_of_all_starts(monkeypatch: pytest.MonkeyP
         ]
         for first in (True, False)
     ]
-    found = exchange.best_of(renewal, Found(renewal, none), halves)
+    found = exchange.best_of(Found(renewal, none), halves)
     assert (renewal.table(found.sets).sets != best.sets).nnz == 0
-    kept = exchange.best_of(renewal, Found(renewal, good), [none, *halves])
+    kept = exchange.best_of(Found(renewal, good), [none, *halves])
     assert all((new == old).all() for new, old in zip(kept.sets, good, strict=True))
 
 
 def test_other_starts_are_led_by_other_prices_and_end_higher() -> None:
     world = make_world("random_walk", size=6, cost=0.15, t_max=2, diagonal=True)
     renewal = Renewal(world, world.motion)
-    first, again = (list(exchange.other_starts(renewal, world, 2)) for _ in range(2))
+    first, again = (list(exchange.other_starts(renewal, 2)) for _ in range(2))
     assert all(
         (one == other).all()
         for each, same in zip(first, again, strict=True)
@@ -188,15 +188,13 @@ def test_of_new_plans_those_are_taken_that_gain_after_the_ones_before(
     """Where modes are hidden a better plan may lower the AIHTR: each key's gain, against whole evaluations."""
     world = make_world("heading", size=3, memory="displacement").but(**options)
     renewal = Renewal(world, world.motion)
-    policy = search.follow_credit(
-        renewal, world, Found(renewal, search.clocked_sets(renewal, world)), rounds, 1
-    )
-    plans = renewal.problem(policy.value, search.shares(renewal, policy))
+    policy = search.follow_credit(Found(renewal, search.clocked_sets(renewal)), rounds, 1)
+    plans = policy.plans()
     every = np.ones(len(renewal.plans), dtype=bool)
     sets = exchange.exchange(plans, policy.sets, every)
     order = np.random.default_rng(0).permutation(len(renewal.plans))
     order = order[search.rows_changed(plans.layout, policy.sets, sets)[order]]
-    taken = search._gaining(renewal, policy, sets, order)
+    taken = search._gaining(policy, sets, order)
     assert 0 < len(taken) < len(order)
     now, rows = policy, np.zeros(len(renewal.plans), dtype=bool)
     for row in order:

@@ -59,8 +59,8 @@ def test_exchange_goes_on_where_one_set_at_a_time_stops() -> None:
     renewal = Renewal(world, world.motion)
     none = [np.zeros(len(choice.rows), dtype=bool) for choice in renewal.choices]
     start = Found(renewal, none)
-    one = search.ascended(renewal, start)
-    assert exchange.exchanged(renewal, start).aihtr > one.aihtr > start.aihtr
+    one = search.ascended(start)
+    assert exchange.exchanged(start).aihtr > one.aihtr > start.aihtr
 
 
 @pytest.mark.slow
@@ -96,7 +96,7 @@ def test_a_child_has_the_plans_of_two(monkeypatch: pytest.MonkeyPatch) -> None:
     search, begun = hidden.Search(world), list[Found]()
     renewal, rng = search.renewal, np.random.default_rng(0)
     every, none = ([np.full(len(c.rows), on) for c in renewal.choices] for on in (True, False))
-    better = exchange.exchanged(renewal, Found(renewal, none))
+    better = exchange.exchanged(Found(renewal, none))
     monkeypatch.setattr(hidden, "exchanged", lambda *a, **_: begun.append(a[1]) or better)
     pool = search.crossed([Found(renewal, every), Found(renewal, none)], 1, rng)
     rows, on = renewal.choices[0].rows, begun[0].sets[0]

@@ -253,7 +253,7 @@ def test_the_solution_is_no_worse_than_the_policy_it_was_handed(
     world = paper_world(5, 0.22, 2)
     best = optimal.solve(world)
     # Without the exchange, which finds the optimum of all worlds small enough to be certified in a test.
-    monkeypatch.setattr(optimal, "exchanged", lambda _, policy, **__: policy)
+    monkeypatch.setattr(optimal, "exchanged", lambda policy, **_: policy)
     alone = optimal.solve(world, nodes=1)
     assert alone.lower < best.lower
     handed = optimal.solve(world, nodes=1, start=best.table)
@@ -271,15 +271,13 @@ def test_an_open_bracket_is_searched_again_from_other_starts(
     world = open_world()
     better = optimal.solve(world, nodes=1).table
     # without exchange the first policy is worse, and stays so unless a restart is used
-    monkeypatch.setattr(optimal, "exchanged", lambda _, policy, **__: policy)
+    monkeypatch.setattr(optimal, "exchanged", lambda policy, **_: policy)
     monkeypatch.setattr(optimal, "FIRST_NODES", 1_000)
     found: list[BoolArray] = []
 
-    def restarted(
-        renewal: Renewal, policy: Found, others: Iterable[list[BoolArray]], **_: Any
-    ) -> Found:
+    def restarted(policy: Found, others: Iterable[list[BoolArray]], **_: Any) -> Found:
         assert len(list(others)) == optimal.RESTARTS
-        return Found(renewal, found) if found else policy
+        return Found(policy.renewal, found) if found else policy
 
     monkeypatch.setattr(optimal, "best_of", restarted)
     alone = optimal.solve(world, nodes=4_000)

@@ -14,8 +14,7 @@ from scipy.special import expit
 
 from trackmdp.arrays.types import Array
 from trackmdp.solvers.renewal import Renewal
-from trackmdp.solvers.search import Found, candidates_of, columns_of, credit_of, shares
-from trackmdp.world.model import World
+from trackmdp.solvers.search import Found, candidates_of, columns_of, credit_of
 
 _STEPS, _HOT, _WARM, _COLD = 40, 0.2, 0.03, 0.01
 """Temperatures; the first one, where the optimistic credit leads as well; and the last, in rewards."""
@@ -25,16 +24,16 @@ _OFF, _LED = 0.05, 0.7
 """Standard deviation by which advantages are off at first, in rewards, and the share of the steps that are led."""
 
 
-def anneal(renewal: Renewal, world: World, rng: np.random.Generator, *, led: bool = False) -> Found:
+def anneal(renewal: Renewal, rng: np.random.Generator, *, led: bool = False) -> Found:
     """The policy at the end of all temperatures, from random chances.
 
     Args:
         renewal: the problem.
-        world: its task and motion.
         rng: draws the chances.
         led: whether the clocked bound's credit leads, as in the homotopy of `search`, with errors that fade. Both
             kinds are needed: where a safe action misses this one ends lower, and higher where it does not.
     """
+    world = renewal.world
     odds, off = (
         [spread * rng.standard_normal(len(choice.rows)) for choice in renewal.choices]
         for spread in (_SPREAD, _OFF * world.reward)
@@ -44,7 +43,7 @@ def anneal(renewal: Renewal, world: World, rng: np.random.Generator, *, led: boo
         share = max(0.0, 1.0 - step / (_LED * _STEPS)) if led else 0.0
         chances = _chances(renewal, odds)
         policy = Found(renewal, chances, policy)
-        plans = renewal.problem(policy.value, shares(renewal, policy), credit)
+        plans = policy.plans(credit)
         advantages = plans.advantages(candidates_of(chances), share)
         # Half of the odds before are kept: best answers of all sensors at once overshoot.
         odds = [

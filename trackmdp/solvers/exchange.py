@@ -16,12 +16,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.entries import per_row
+from trackmdp.arrays.entries import ranks
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
@@ -41,7 +41,6 @@ from trackmdp.solvers.search import (
     mixed,
     risen,
     rows_changed,
-    shares,
 )
 from trackmdp.world.model import World
 
@@ -67,8 +66,8 @@ def _flips() -> BoolArray:
     """`[SINGLES + 1, C]` whether each candidate flips the sensor of each rank; the last row is for all others."""
     pairs = [*((rank,) for rank in range(SINGLES)), *itertools.combinations(range(PAIRED), 2)]
     flipped = np.zeros((SINGLES + 1, len(pairs)), dtype=bool)
-    for candidate, ranks in enumerate(pairs):
-        flipped[list(ranks), candidate] = True
+    for candidate, places in enumerate(pairs):
+        flipped[list(places), candidate] = True
     return flipped
 
 
@@ -78,36 +77,35 @@ FLIPPED = _flips()
 def solve(world: World, starts: int = OTHERS) -> PolicyTable:
     """The policy of `search`, improved by exchange, and from t_max 2 on by the results of `starts` other searches."""
     renewal = Renewal(world, world.motion)
-    first = Found(renewal, clocked_sets(renewal, world))
-    after = follow_credit(renewal, world, first)
-    policy = exchanged(renewal, after if after.aihtr >= first.aihtr else first)
+    first = Found(renewal, clocked_sets(renewal))
+    after = follow_credit(first)
+    policy = exchanged(after if after.aihtr >= first.aihtr else first)
     if world.num_choices > 2 and renewal.size is not None:
-        policy = best_of(renewal, policy, other_starts(renewal, world, starts))
-    return renewal.table(policy.sets)
+        policy = best_of(policy, other_starts(renewal, starts))
+    return policy.table
 
 
 def improve(world: World, policy: PolicyTable, *, once: bool = False) -> PolicyTable:
     """The result of exchange (`once`: one round of it) from a deterministic `policy`; its AIHTR is no lower."""
     renewal, rounds = Renewal(world, world.motion), 1 if once else _ROUNDS
     start = Found(renewal, renewal.sets(policy))
-    return renewal.table(exchanged(renewal, start, rounds=rounds).sets)
+    return exchanged(start, rounds=rounds).table
 
 
 def other_starts(
-    renewal: Renewal, world: World, count: int, steps: int = _STEPS, sweeps: int = 3
+    renewal: Renewal, count: int, steps: int = _STEPS, sweeps: int = 3
 ) -> Iterator[list[BoolArray]]:
     """The results of `search` with prices a little off; nothing on large grids."""
-    rng = np.random.default_rng(derive(0, "exchange", "starts"))
+    world, rng = renewal.world, np.random.default_rng(derive(0, "exchange", "starts"))
     for _ in range(count if world.num_cells <= MOST_STARTED else 0):
         off = np.exp(PRICES_OFF * rng.standard_normal(world.total_sensors))
         other = replace(world, cost=world.cost * off)
         led = renewal.priced_as(other)
-        first = Found(led, clocked_sets(led, other))
-        yield follow_credit(led, other, first, steps, sweeps).sets
+        first = Found(led, clocked_sets(led))
+        yield follow_credit(first, steps, sweeps).sets
 
 
 def best_of(
-    renewal: Renewal,
     policy: Found,
     others: Iterable[list[BoolArray]],
     *,
@@ -119,7 +117,7 @@ def best_of(
     """
     start = policy
     for other in others:
-        plans = renewal.problem(policy.value, shares(renewal, policy))
+        plans = policy.plans()
         after = columns_of(plans.ascend(candidates_of(other), sweeps=10))
         # Where these are the plans at hand, exchange has been tried.
         tried = exchange(plans, after, rows_changed(plans.layout, policy.sets, after), go_on)
@@ -128,14 +126,13 @@ def best_of(
         )
         better = other_worth > worth + 1e-10 * (1.0 + np.abs(worth))
         sets = mixed(plans.layout, better, tried, policy.sets)
-        policy = risen(renewal, policy, plans, sets) or policy
+        policy = risen(policy, plans, sets) or policy
         if not go_on():
             break
-    return policy if policy is start else exchanged(renewal, policy, go_on=go_on)
+    return policy if policy is start else exchanged(policy, go_on=go_on)
 
 
 def exchanged(
-    renewal: Renewal,
     policy: Found,
     *,
     go_on: GoOn = always,
@@ -145,27 +142,24 @@ def exchanged(
     """Policy iteration by exchange, until the AIHTR no longer grows.
 
     Args:
-        renewal: the problem.
         policy: where to start.
         go_on: asked before each part whether to look further.
         rounds: at most so many; the first one gains most.
         exact: whether sets of shared sensors are at last the best ones, by linear programs.
     """
+    renewal = policy.renewal
     everywhere = np.ones(len(renewal.plans), dtype=bool)
     tried = everywhere
     for _ in range(rounds):
         if policy.visits is None:
             plans = renewal.problem(policy.value)
-            some = tried & could_gain(renewal, plans, policy)
+            some = tried & could_gain(plans, policy)
         else:
             plans = renewal.problem(policy.value, policy.visits)
-            normal = renewal.count - renewal.events.forced
-            some = tried & (
-                per_row(renewal.owner[:normal], policy.visits[:normal], len(tried)) > _SEEN
-            )
+            some = tried & (renewal.by_plan(policy.visits) > _SEEN)
         sets = columns_of(plans.ascend(candidates_of(policy.sets), sweeps=10))
         sets = exchange(plans, sets, some, go_on)
-        better = risen(renewal, policy, plans, sets)
+        better = risen(policy, plans, sets)
         if better is not None:
             # Where nothing was gained nothing is tried again, until the others have settled as well: V has then moved.
             moved = rows_changed(plans.layout, policy.sets, sets)
@@ -176,14 +170,14 @@ def exchanged(
             tried = everywhere
         if not go_on():
             break
-    return ascended(renewal, policy) if exact and renewal.task.coverage is not None else policy
+    return ascended(policy) if exact and renewal.task.coverage is not None else policy
 
 
-def could_gain(renewal: Renewal, plans: Plans, policy: Found) -> BoolArray:
+def could_gain(plans: Plans, policy: Found) -> BoolArray:
     """`[K]`, whether a plan is worth less than it could be if the position were revealed after every set."""
+    renewal, world = policy.renewal, policy.renewal.world
     if renewal.size is None:
         return np.ones(len(renewal.plans), dtype=bool)
-    world = renewal.world
     detected = world.reward + policy.value[: world.num_cells]
     most = revealed(world, detected, forced_worth(world, detected), plans.length)
     return hopeful(plans, policy.sets, most)
@@ -217,129 +211,91 @@ def exchange(
     improved = [on.copy() for on in sets]
     if plans.length < 2 or not rows.any():  # the last set is always a best answer
         return improved
-    cutter = _Cutter(plans, np.flatnonzero(rows))
-    for part in itertools.takewhile(lambda _: go_on(), cutter.parts()):
-        some, decisions = cutter.cut(part)
-        found = _Exchange(some).run(
-            [on[place] for on, place in zip(improved, decisions, strict=True)]
-        )
+    for part in itertools.takewhile(lambda _: go_on(), _parts(plans, np.flatnonzero(rows))):
+        some, decisions = _cut(plans, part)
+        found = _exchanged(some, [on[place] for on, place in zip(improved, decisions, strict=True)])
         for on, place, plan in zip(improved, decisions, found, strict=True):
             on[place] = plan
     return improved
 
 
-class _Cutter:
-    """Cuts plans into parts of some of the rows, in order.
-
-    Args:
-        plans: to be cut.
-        rows: `[L]`, the rows that are wanted, in order.
-    """
-
-    def __init__(self, plans: Plans, rows: IndexArray) -> None:
-        self._plans, self._rows = plans, rows
-        number = np.full(plans.layout.count, -1)
-        number[rows] = np.arange(len(rows))
-        # Of each step the wanted entries in order of their rows, and where those of each row begin.
-        self._order, self._begin = [], []
-        for owner in plans.layout.rows:
-            mine = np.flatnonzero(number[owner] >= 0)
-            mine = mine[np.argsort(number[owner[mine]], kind="stable")]
-            count = np.bincount(number[owner[mine]], minlength=len(rows))
-            self._order.append(mine)
-            self._begin.append(np.concatenate([[0], np.cumsum(count)]))
-
-    def parts(self) -> Iterator[slice]:
-        """Ranges of the wanted rows, as many at once as `MOST_NUMBERS` allows."""
-        # Rows with 40, 50 and 30 entries, and room for 100: their sums 40, 90, 120 fall into the parts 0, 0, 1.
-        entries = np.max([np.diff(begin) for begin in self._begin], axis=0)
-        number = (np.cumsum(entries) - 1) // max(1, MOST_NUMBERS // FLIPPED.shape[1])
-        ends = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(entries)]
-        yield from (slice(low, high) for low, high in itertools.pairwise(ends) if high > low)
-
-    def cut(self, part: slice) -> tuple[Plans, list[IndexArray]]:
-        """The plans of a part, and which decisions are theirs, for each step."""
-        plans, rows = self._plans, self._rows[part]
-        kept = [
-            np.sort(order[begin[part.start] : begin[part.stop]])
-            for order, begin in zip(self._order, self._begin, strict=True)
-        ]
-        local = np.searchsorted(rows, plans.layout.rows[0][kept[0]])
-        turns: list[Turn] = []
-        decisions: list[IndexArray] = []
-        start = local
-        for turn, before, now in zip(plans.turns, kept, kept[1:], strict=False):
-            mine = np.flatnonzero(np.isin(turn.choice.rows, rows))
-            choice = turn.choice.part(mine, now, rows)
-            moves = _columns(turn.moves[before], now)
-            local = np.searchsorted(rows, turn.rows[now])
-            turns.append(Turn(local, moves, turn.stay[before], choice, turn.price[mine]))
-            decisions.append(mine)
-        detected = [each[now, 0] for each, now in zip(plans.detected, kept[1:], strict=True)]
-        layout = Layout(start, turns, len(rows))
-        last = plans.missed[kept[-1], 0]
-        return Plans(layout, plans.mass[kept[0], 0], detected, last), decisions
+def _parts(plans: Plans, rows: IndexArray) -> Iterator[IndexArray]:
+    """The `rows` `[L]` in order, as many at once as `MOST_NUMBERS` allows."""
+    # Rows with 40, 50 and 30 entries, and room for 100: their sums 40, 90, 120 fall into the parts 0, 0, 1.
+    count = plans.layout.count
+    entries = np.max([np.bincount(each, minlength=count) for each in plans.layout.rows], axis=0)
+    number = (np.cumsum(entries[rows]) - 1) // max(1, MOST_NUMBERS // FLIPPED.shape[1])
+    yield from np.split(rows, np.flatnonzero(np.diff(number)) + 1)
 
 
-def _columns(matrix: sparse.csr_array, kept: IndexArray) -> sparse.csr_array:
-    """The columns `kept` of a matrix that has entries in no others."""
-    place = np.searchsorted(kept, matrix.indices)
-    return sparse.csr_array((matrix.data, place, matrix.indptr), shape=(matrix.shape[0], len(kept)))
+def _cut(plans: Plans, rows: IndexArray) -> tuple[Plans, list[IndexArray]]:
+    """The plans of some rows, and which decisions are theirs, for each step."""
+    some = np.zeros(plans.layout.count, dtype=bool)
+    some[rows] = True
+    kept = [np.flatnonzero(some[owner]) for owner in plans.layout.rows]
+    local = [
+        np.searchsorted(rows, owner[now])
+        for owner, now in zip(plans.layout.rows, kept, strict=True)
+    ]
+    turns: list[Turn] = []
+    decisions: list[IndexArray] = []
+    for turn, before, now, owner in zip(plans.turns, kept, kept[1:], local[1:], strict=False):
+        mine = np.flatnonzero(some[turn.choice.rows])
+        moves = turn.moves[before]
+        # Moves of these rows lead to entries of theirs alone.
+        place = np.searchsorted(now, moves.indices)
+        moves = sparse.csr_array((moves.data, place, moves.indptr), shape=(len(before), len(now)))
+        choice = turn.choice.part(mine, now, rows)
+        turns.append(Turn(owner, moves, turn.stay[before], choice, turn.price[mine]))
+        decisions.append(mine)
+    detected = [each[now, 0] for each, now in zip(plans.detected, kept[1:], strict=True)]
+    layout = Layout(local[0], turns, len(rows))
+    last = plans.missed[kept[-1], 0]
+    return Plans(layout, plans.mass[kept[0], 0], detected, last), decisions
 
 
-@dataclass(frozen=True)
-class _Exchange:
-    """Candidates of some plans."""
-
-    plans: Plans
-
-    def run(self, sets: Sequence[BoolArray]) -> list[BoolArray]:
-        """The better plans `[G]` for each step."""
-        plans, plan = self.plans, candidates_of(sets)
-        worth = plans.worth(plan)
-        for step in range(1, plans.length):
-            mass = plans.pushed(plan, step)
-            first = plan[step - 1] ^ FLIPPED[self.ranks(step, plan, mass)]
-            # The sets before the flip are held in these sweeps, so that they need no more than the mass that is left.
-            left = plans.missing(step, first, mass)
-            later = plans.ascend(plan[step:], mass=left, since=step, sweeps=LATER_SWEEPS)
-            every = plans.ascend([*plan[: step - 1], first, *later], sweeps=ALL_SWEEPS)
-            plan, worth = self.better(plan, worth, every)
-        return columns_of(plan)
-
-    def better(
-        self, plan: list[BoolArray], worth: Array, candidates: list[BoolArray]
-    ) -> tuple[list[BoolArray], Array]:
-        """The best candidate of each row in place of its plan, if it is worth more; and its worth."""
-        reached = self.plans.worth(candidates)
-        best = reached.argmax(axis=1)[:, None]
-        most = np.take_along_axis(reached, best, axis=1)
-        gains = most > worth + 1e-10 * (1.0 + np.abs(worth))
-        chosen = []
-        for turn, on, old in zip(self.plans.turns, candidates, plan, strict=True):
-            rows, wide = turn.choice.rows, np.broadcast_to(on, (len(on), reached.shape[1]))
-            new = np.take_along_axis(wide, best[rows], axis=1)
-            chosen.append(np.where(gains[rows], new, old))
-        return chosen, np.where(gains, most, worth)
-
-    def ranks(self, step: int, plan: list[BoolArray], mass: Array) -> IndexArray:
-        """`[G]` how near each decision at `step` is to the other choice, 0 the nearest; SINGLES: never flipped."""
-        plans, choice = self.plans, self.plans.turns[step - 1].choice
-        later = plans.after(plan[step - 1 :], step - 1)[0]
-        gain = mass * (plans.detected[step - 1] - later)
-        margin = choice.margin(plan[step - 1], gain, plans.priced(step, mass))
-        possible = choice.gained(mass)[:, 0] > 0
-        rank = np.minimum(ranked(choice.rows, margin, possible), SINGLES)
-        if choice.allowed is not None:
-            possible &= choice.allowed[:, 0]
-        return np.where(possible, rank, SINGLES)
+def _exchanged(plans: Plans, sets: Sequence[BoolArray]) -> list[BoolArray]:
+    """The better plans `[G]` for each step."""
+    plan = candidates_of(sets)
+    worth = plans.worth(plan)
+    for step in range(1, plans.length):
+        mass = plans.pushed(plan, step)
+        first = plan[step - 1] ^ FLIPPED[_ranks(plans, step, plan, mass)]
+        # The sets before the flip are held in these sweeps, so that they need no more than the mass that is left.
+        left = plans.missing(step, first, mass)
+        later = plans.ascend(plan[step:], mass=left, since=step, sweeps=LATER_SWEEPS)
+        every = plans.ascend([*plan[: step - 1], first, *later], sweeps=ALL_SWEEPS)
+        plan, worth = _better(plans, plan, worth, every)
+    return columns_of(plan)
 
 
-def ranked(rows: IndexArray, margin: Array, possible: BoolArray) -> IndexArray:
-    """`[G]` place of each decision among those of its row, least margin first, the impossible ones last."""
-    order = np.lexsort((margin, ~possible, rows))
-    # Decisions are in order of their rows, and ranks run from 0 within each: with rows 0 0 1 1 1 the first are
-    # 0 0 2 2 2, and the ranks of `order` 0 1 0 1 2.
+def _better(
+    plans: Plans, plan: list[BoolArray], worth: Array, candidates: list[BoolArray]
+) -> tuple[list[BoolArray], Array]:
+    """The best candidate of each row in place of its plan, if it is worth more; and its worth."""
+    reached = plans.worth(candidates)
+    best = reached.argmax(axis=1)[:, None]
+    most = np.take_along_axis(reached, best, axis=1)
+    gains = most > worth + 1e-10 * (1.0 + np.abs(worth))
+    chosen = []
+    for turn, on, old in zip(plans.turns, candidates, plan, strict=True):
+        rows, wide = turn.choice.rows, np.broadcast_to(on, (len(on), reached.shape[1]))
+        new = np.take_along_axis(wide, best[rows], axis=1)
+        chosen.append(np.where(gains[rows], new, old))
+    return chosen, np.where(gains, most, worth)
+
+
+def _ranks(plans: Plans, step: int, plan: list[BoolArray], mass: Array) -> IndexArray:
+    """`[G]` how near each decision at `step` is to the other choice, 0 the nearest; SINGLES: never flipped."""
+    choice = plans.turns[step - 1].choice
+    later = plans.after(plan[step - 1 :], step - 1)[0]
+    gain = mass * (plans.detected[step - 1] - later)
+    margin = choice.margin(plan[step - 1], gain, plans.priced(step, mass))
+    possible = choice.gained(mass)[:, 0] > 0
+    # Least margin first within each row, the impossible ones last.
+    order = np.lexsort((margin, ~possible, choice.rows))
     rank = np.empty(len(order), dtype=np.int64)
-    rank[order] = np.arange(len(order)) - np.searchsorted(rows, rows)
-    return rank
+    rank[order] = np.minimum(ranks(choice.rows), SINGLES)
+    if choice.allowed is not None:
+        possible &= choice.allowed[:, 0]
+    return np.where(possible, rank, SINGLES)

@@ -131,7 +131,7 @@ class Search:
 
     def __init__(self, world: World, watch: Watch = lambda *_: True) -> None:
         self.world, self.renewal = world, Renewal(world, world.motion)
-        self.best = self._first = Found(self.renewal, clocked_sets(self.renewal, world))
+        self.best = self._first = Found(self.renewal, clocked_sets(self.renewal))
         self._watch, self._done, self._most = watch, 0, 1
         # Sets after exchange, by those before: many searches begin from the same ones.
         self._ends: dict[bytes, list[AnyArray]] = {}
@@ -139,7 +139,7 @@ class Search:
     @property
     def table(self) -> PolicyTable:
         """The best policy so far."""
-        return self.renewal.table(self.best.sets)
+        return self.best.table
 
     def run(
         self, *, start: PolicyTable | None = None, annealed: int = 0, effort: float = 1.0
@@ -164,7 +164,7 @@ class Search:
             for _ in range(times):
                 self.crossed(pool, count // times, rng)
         if self._goes_on():
-            self.best = exchanged(self.renewal, self.best)
+            self.best = exchanged(self.best)
 
     def _goes_on(self) -> bool:
         return self._watch(self.best, self._done / self._most)
@@ -176,7 +176,7 @@ class Search:
             found = Found(self.renewal, self._ends[mark], policy)
         else:
             rounds = _ROUNDS // self._slower
-            found = exchanged(self.renewal, policy, go_on=self._goes_on, rounds=rounds, exact=False)
+            found = exchanged(policy, go_on=self._goes_on, rounds=rounds, exact=False)
             self._ends[mark] = self._ends[_bytes(found.sets)] = found.sets
         self._done += 1
         self.best = max(self.best, found, key=_worth)
@@ -221,17 +221,17 @@ class Search:
 
     def _starts(self, start: PolicyTable | None, led: int, annealed: int) -> Iterator[Found]:
         """Policies to search from: a known one, those of homotopies, and annealed ones."""
-        renewal, world = self.renewal, self.world
+        renewal = self.renewal
         if start is not None:
             yield Found(renewal, renewal.sets(start))
         if led:
             first, go_on = self._first, self._goes_on
-            yield follow_credit(renewal, world, first, _STEPS, _SWEEPS, go_on=go_on)
-            for sets in other_starts(renewal, world, led - 1, _STEPS, _SWEEPS):
+            yield follow_credit(first, _STEPS, _SWEEPS, go_on=go_on)
+            for sets in other_starts(renewal, led - 1, _STEPS, _SWEEPS):
                 yield Found(renewal, sets)
         rng = np.random.default_rng(derive(0, "hidden", "annealed"))
         for place in range(annealed):
-            yield anneal(renewal, world, rng, led=place % 2 == 1)
+            yield anneal(renewal, rng, led=place % 2 == 1)
 
     @property
     def _work(self) -> int:

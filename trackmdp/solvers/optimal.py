@@ -124,7 +124,7 @@ class _Run:
         if self.world.modes == 1:
             self.policy = clocked_policy(self.world)
         else:
-            self.policy = self.renewal.table(clocked_sets(self.renewal, self.world))
+            self.policy = self.renewal.table(clocked_sets(self.renewal))
         self.evaluation = self.valued(self.policy, self.bound)
 
     def valued(self, policy: PolicyTable, guess: Array) -> Evaluation:
@@ -194,8 +194,7 @@ class _Run:
             self.search_regions(self.side)
             return
         # First the policy, then the proof: branch and bound is the faster the better its start.
-        led = follow_credit(self.renewal, self.world, self.here, go_on=self.budget.left)
-        self.use(self.renewal.table(led.sets))
+        self.use(follow_credit(self.here, go_on=self.budget.left).table)
         self.use(self.exchanged(self.here))
         # Last: the search's own result does not depend on `start`.
         if self.start is not None:
@@ -259,9 +258,8 @@ class _Run:
 
     def restart(self) -> bool:
         """Search from other starts; whether that gave a better policy, to be used next."""
-        others = other_starts(self.renewal, self.world, RESTARTS)
-        best = best_of(self.renewal, self.here, others, go_on=self.budget.left)
-        table = self.renewal.table(best.sets)
+        others = other_starts(self.renewal, RESTARTS)
+        table = best_of(self.here, others, go_on=self.budget.left).table
         better = bool(self.valued(table, self.value).starts.sum() > self.value.sum())
         self.other = table if better else None
         return better
@@ -315,7 +313,7 @@ class _Run:
 
     def exchanged(self, policy: Found) -> PolicyTable:
         """The result of exchange from `policy`."""
-        return self.renewal.table(exchanged(self.renewal, policy, go_on=self.budget.left).sets)
+        return exchanged(policy, go_on=self.budget.left).table
 
     def explore(self, tree: Tree, patience: int) -> None:
         """Run the tree until it is closed or the budget is spent.

@@ -95,7 +95,7 @@ class Renewal:
     @cached_property
     def single(self) -> bool:
         """Whether each key has one event, so that plans of more worth raise the value of every event."""
-        return len(self.plans) == self.count - self.events.forced
+        return len(self.plans) == self.normal
 
     @property
     def states(self) -> IndexArray:
@@ -106,6 +106,11 @@ class Renewal:
     def count(self) -> int:
         """B, events."""
         return len(self.owner)
+
+    @property
+    def normal(self) -> int:
+        """Events of detections: all but the last ones, of missed safe actions."""
+        return self.count - self.events.forced
 
     @cached_property
     def first(self) -> IndexArray:
@@ -120,7 +125,7 @@ class Renewal:
     def passes(self, acts: Iterable[Act]) -> list[Passed]:
         """The steps of all events under a policy; their figures are complete but for the sensors."""
         task, found = self.task, []
-        mass = np.ones(self.count - self.events.forced)
+        mass = np.ones(self.normal)
         for step, (report, spent) in zip(self.steps, acts, strict=False):
             now, mass = passed(task, step, mass, report, spent, 0.0, self.count)
             found.append(now)
@@ -172,8 +177,7 @@ class Renewal:
         detected = [task.reward + value[step.following] for step in free]
         if credit is not None:
             credit = [each[step.states] for each, step in zip(credit, free, strict=True)]
-        normal = self.count - self.events.forced
-        mass = np.ones(normal) if weight is None else weight[:normal]
+        mass = np.ones(self.normal) if weight is None else weight[: self.normal]
         return Plans(self.layout, mass, detected, self.missed(value), credit)
 
     @cached_property
@@ -189,7 +193,7 @@ class Renewal:
             )
             for step, choice in zip(self.steps, self.choices, strict=False)
         ]
-        return Layout(self.owner[: self.count - self.events.forced], turns, len(self.plans))
+        return Layout(self.owner[: self.normal], turns, len(self.plans))
 
     def missed(self, value: Array) -> Array:
         """`[E]` worth of the target's being missed at the last free choice."""
@@ -203,11 +207,14 @@ class Renewal:
 
     def shares(self, visits: Array) -> Array:
         """`[B]`, share of each event in the visits of its key; of a key that is never visited all are alike."""
-        normal = self.count - self.events.forced
-        owner, visits = self.owner[:normal], visits[:normal]
-        total = per_row(owner, visits, len(self.plans))[owner]
+        owner = self.owner[: self.normal]
+        total = self.by_plan(visits)[owner]
         alike = 1.0 / np.bincount(owner)[owner]
-        return np.where(total > 1e-12, visits / np.maximum(total, 1e-300), alike)
+        return np.where(total > 1e-12, visits[: self.normal] / np.maximum(total, 1e-300), alike)
+
+    def by_plan(self, visits: Array) -> Array:
+        """`[K]`, sums of `visits` `[B]` over the events of each key."""
+        return per_row(self.owner[: self.normal], visits[: self.normal], len(self.plans))
 
     def priced_as(self, task: Task) -> Renewal:
         """The same renewal with the prices of another task."""

@@ -18,7 +18,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-from trackmdp.arrays.entries import per_row
 from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
 from trackmdp.policies.table import PolicyTable
 from trackmdp.recordings.tracks import ends_of
@@ -52,7 +51,7 @@ class Found:
         near: a policy of about the same value, or such a value `[B]`: where iterations begin.
 
     Attributes:
-        sets: as given.
+        renewal, sets: as given.
         visits: `[B]`, of an episode; None where plans have one event each, and nothing depends on them.
         aihtr: mean value of the starts.
         system: of its values.
@@ -61,7 +60,7 @@ class Found:
     def __init__(
         self, renewal: Renewal, sets: Sequence[AnyArray], near: Found | Array | None = None
     ) -> None:
-        self.sets = list(sets)
+        self.renewal, self.sets = renewal, list(sets)
         self._guess = near.value if isinstance(near, Found) else near
         self.system, self._earned = renewal.system(sets, guessed=self._guess is not None)
         self.visits: Array | None = None
@@ -79,28 +78,41 @@ class Found:
         return self.system.solve(self._earned, self._guess)
 
     @property
+    def table(self) -> PolicyTable:
+        """The policy of the sets."""
+        return self.renewal.table(self.sets)
+
+    def plans(self, credit: Sequence[Array] | None = None, value: Array | None = None) -> Plans:
+        """The plans of all keys, each event weighted by its share in the visits of its key.
+
+        The worth of an event is this policy's, or a `value` `[B]`; `credit` is as of `Renewal.problem`.
+        """
+        weight = None if self.visits is None else self.renewal.shares(self.visits)
+        return self.renewal.problem(self.value if value is None else value, weight, credit)
+
+    @property
     def rounding(self) -> float:
         """Gain of AIHTR that is too little to go on for: rounding, or with several events a key a ten-millionth."""
         return (1e-12 if self.visits is None else 1e-7) * float(np.abs(self.value).mean())
 
 
-def risen(renewal: Renewal, policy: Found, plans: Plans, sets: Sequence[BoolArray]) -> Found | None:
+def risen(policy: Found, plans: Plans, sets: Sequence[BoolArray]) -> Found | None:
     """The policy with as many of the new plans `sets` as raise the AIHTR; None if none do.
 
     All of them; else, where keys have several events, those that gain one after another (`_gaining`). Where the system
     is too large for that: the plans of those rows that gain most, half as many each time, and at last some rows alone.
     A few changes alter the visits little, so that their gains are those expected.
     """
-    layout, old = plans.layout, policy.sets
+    renewal, layout, old = policy.renewal, plans.layout, policy.sets
     moved = rows_changed(layout, old, sets)
     if not moved.any():
         return None
     worth, other = (plans.worth(candidates_of(each))[:, 0] for each in (old, sets))
-    gain = (other - worth) * _episodes(renewal, policy, plans)
+    gain = (other - worth) * _episodes(policy, plans)
     order = np.argsort(-gain, kind="stable")
     order = order[moved[order]]
     if not renewal.single and renewal.count <= _TOGETHER:
-        tries = iter([_gaining(renewal, policy, sets, order)])
+        tries = iter([_gaining(policy, sets, order)])
     else:
         tries = _tries(order, alone=not renewal.single)
     for rows in tries:
@@ -115,16 +127,15 @@ def risen(renewal: Renewal, policy: Found, plans: Plans, sets: Sequence[BoolArra
     return None
 
 
-def _gaining(
-    renewal: Renewal, policy: Found, sets: Sequence[BoolArray], order: IndexArray
-) -> IndexArray:
+def _gaining(policy: Found, sets: Sequence[BoolArray], order: IndexArray) -> IndexArray:
     """Those rows of `order` whose new plans `sets` raise the AIHTR, after those before them that do.
 
     With the visits v, the advantage a = b' - (I - T') V of the new plans, and M = I - (T' - T)(I - T)^-1, new plans of
     the events C gain v_C M_CC^-1 a_C. One row more gains the same of what elimination of C leaves of v, M and a.
     """
     assert policy.visits is not None
-    owner = renewal.owner[: renewal.count - renewal.events.forced]
+    renewal = policy.renewal
+    owner = renewal.owner[: renewal.normal]
     events = [np.flatnonzero(owner == row) for row in order]
     states = np.concatenate(events)
     system, earned = renewal.system(sets)
@@ -173,20 +184,14 @@ def _tries(order: IndexArray, *, alone: bool) -> Iterator[IndexArray]:
         yield from (order[place : place + 1] for place in range(1, min(len(order), _ALONE)))
 
 
-def _episodes(renewal: Renewal, policy: Found, plans: Plans) -> Array | float:
+def _episodes(policy: Found, plans: Plans) -> Array | float:
     """`[K]`, visits of each row in an episode over the mass that `plans` start with there; 1 where not needed."""
     if policy.visits is None:
         return 1.0
-    normal = renewal.count - renewal.events.forced
-    visits = per_row(renewal.owner[:normal], policy.visits[:normal], len(renewal.plans))
+    visits = policy.renewal.by_plan(policy.visits)
     mass = (plans.layout.sums(0) @ plans.mass)[:, 0]
     # Visits as solved for may be a rounding below 0.
     return np.where(mass > 1e-12, visits / np.maximum(mass, 1e-12), 0.0)
-
-
-def shares(renewal: Renewal, policy: Found) -> Array | None:
-    """`[B]`, weight of each event among those of its key under a policy; None where all are 1."""
-    return None if policy.visits is None else renewal.shares(policy.visits)
 
 
 def solve(world: World, *, steps: int = 30, sweeps: int = 3) -> PolicyTable:
@@ -195,9 +200,9 @@ def solve(world: World, *, steps: int = 30, sweeps: int = 3) -> PolicyTable:
     The better one of it and the clocked policy, so that it is never worse than that.
     """
     renewal = Renewal(world, world.motion)
-    first = Found(renewal, clocked_sets(renewal, world))
-    after = follow_credit(renewal, world, first, steps, sweeps)
-    return renewal.table((after if after.aihtr >= first.aihtr else first).sets)
+    first = Found(renewal, clocked_sets(renewal))
+    after = follow_credit(first, steps, sweeps)
+    return (after if after.aihtr >= first.aihtr else first).table
 
 
 def credit_of(world: World) -> list[Array]:
@@ -207,11 +212,11 @@ def credit_of(world: World) -> list[Array]:
     return list((world.reward + table[:, :1] - table[:, 1:]).T)
 
 
-def clocked_sets(renewal: Renewal, world: World) -> list[BoolArray]:
+def clocked_sets(renewal: Renewal) -> list[BoolArray]:
     """The sets that are best by the clocked credit alone, every event of a key as likely."""
     nothing = np.zeros(renewal.count)
     weight = None if renewal.single else renewal.shares(nothing)
-    plans = renewal.problem(nothing, weight, credit_of(world))
+    plans = renewal.problem(nothing, weight, credit_of(renewal.world))
     return columns_of(plans.ascend(plans.none(), sweeps=1, optimism=1.0))
 
 
@@ -226,8 +231,6 @@ def candidates_of(sets: Sequence[AnyArray]) -> list[AnyArray]:
 
 
 def follow_credit(
-    renewal: Renewal,
-    world: World,
     first: Found,
     steps: int = 30,
     sweeps: int = 3,
@@ -238,6 +241,7 @@ def follow_credit(
 
     Where values need not rise, from the best policy on the way.
     """
+    renewal, world = first.renewal, first.renewal.world
     credit, table = credit_of(world), clocked_table(world).table
     # Value and credit change together: V starts as U(., 0), and is the policy's own from the first step on.
     value = table[renewal.states, 0]
@@ -245,26 +249,26 @@ def follow_credit(
     for step in range(steps + 1):
         if not go_on():
             return best
-        plans = renewal.problem(value, shares(renewal, policy), credit)
+        plans = policy.plans(credit, value)
         sets = plans.ascend(candidates_of(policy.sets), sweeps=sweeps, optimism=1.0 - step / steps)
         # Each step of the homotopy moves few sets, so that the value before is a good guess.
         policy = Found(renewal, columns_of(sets), policy if step else value)
         value = policy.value
         if renewal.single or policy.aihtr > best.aihtr:
             best = policy
-    return ascended(renewal, best, go_on=go_on)
+    return ascended(best, go_on=go_on)
 
 
-def ascended(renewal: Renewal, policy: Found, *, sweeps: int = 10, go_on: GoOn = always) -> Found:
+def ascended(policy: Found, *, go_on: GoOn = always) -> Found:
     """Policy iteration by ascent, until the AIHTR no longer grows."""
     exact = False
     while go_on():
-        plans = renewal.problem(policy.value, shares(renewal, policy))
-        sets = columns_of(plans.ascend(candidates_of(policy.sets), sweeps=sweeps, exact=exact))
-        better = risen(renewal, policy, plans, sets)
+        plans = policy.plans()
+        sets = columns_of(plans.ascend(candidates_of(policy.sets), sweeps=10, exact=exact))
+        better = risen(policy, plans, sets)
         if better is not None:
             policy = better
-        elif exact or renewal.task.coverage is None:
+        elif exact or policy.renewal.task.coverage is None:
             return policy
         else:
             exact = True  # with shared sensors, once good sets gain no more, the best ones may
