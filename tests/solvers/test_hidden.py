@@ -97,7 +97,7 @@ def test_a_child_has_the_plans_of_two(monkeypatch: pytest.MonkeyPatch) -> None:
     renewal, rng = search.renewal, np.random.default_rng(0)
     every, none = ([np.full(len(c.rows), on) for c in renewal.choices] for on in (True, False))
     better = exchange.exchanged(Found(renewal, none))
-    monkeypatch.setattr(hidden, "exchanged", lambda *a, **_: begun.append(a[1]) or better)
+    monkeypatch.setattr(hidden, "exchanged", lambda *a, **_: begun.append(a[0]) or better)
     pool = search.crossed([Found(renewal, every), Found(renewal, none)], 1, rng)
     rows, on = renewal.choices[0].rows, begun[0].sets[0]
     share = [on[rows == row].mean() for row in np.unique(rows)]
@@ -138,7 +138,7 @@ def test_no_sets_are_searched_twice_and_a_search_that_finds_nothing_new_ends(
     )
     monkeypatch.setattr(hidden, "_OLD", old)
     monkeypatch.setattr(
-        hidden, "exchanged", lambda *a, **_: begun.append(hidden._bytes(a[1].sets)) or none
+        hidden, "exchanged", lambda *a, **_: begun.append(hidden._bytes(a[0].sets)) or none
     )
     search.crossed([every, none], 800, np.random.default_rng(0))
     assert least < len(begun) == len(set(begun)) <= most

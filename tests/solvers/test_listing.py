@@ -7,10 +7,10 @@ import pytest
 
 from tests.helpers import headings
 from tests.solvers.worlds import best_of_all, footprint_world
-from trackmdp.arrays.types import Array
+from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.certify import listing
-from trackmdp.solvers.certify.listing import Listed, best_plans
+from trackmdp.solvers.certify.listing import best_plans
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.exchange import revealed
 from trackmdp.solvers.linear import forced_worth
@@ -26,7 +26,9 @@ WORLDS = {
 }
 
 
-def listed(world: World, value: Array, slack: float = 1e-9, most: int = 10**9) -> Listed | None:
+def listed(
+    world: World, value: Array, slack: float = 1e-9, most: int = 10**9
+) -> tuple[Array, list[BoolArray]] | None:
     """From sensing nothing, over the values `[Z]` of a detection."""
     renewal, left = Renewal(world, world.motion), most
     none = [np.zeros(len(choice.rows), dtype=bool) for choice in renewal.choices]
@@ -49,8 +51,9 @@ def test_over_the_optimum_the_plans_found_are_its_own(name: str) -> None:
     best = best_of_all(world)
     found = listed(world, best)
     assert found is not None
-    assert found.most == pytest.approx(best, abs=1e-7)
-    table = Renewal(world, world.motion).table(found.sets)
+    most, sets = found
+    assert most == pytest.approx(best, abs=1e-7)
+    table = Renewal(world, world.motion).table(sets)
     assert evaluate(world, table).starts == pytest.approx(best, abs=1e-7)
 
 
@@ -61,9 +64,9 @@ def test_over_a_poor_policy_no_plan_is_worth_more_than_proved(name: str) -> None
     value = evaluate(world, PolicyTable.none(world)).starts
     found = listed(world, value)
     assert found is not None
-    plans = Renewal(world, world.motion).problem(value)
-    worth = plans.worth([on[:, None] for on in found.sets])[:, 0]
-    assert worth == pytest.approx(found.most, abs=1e-8)
+    most, sets = found
+    worth = Renewal(world, world.motion).problem(value).worth_of(sets)
+    assert worth == pytest.approx(most, abs=1e-8)
     assert (worth >= value - 1e-9).all()
     assert worth.sum() > value.sum() + 1e-3
 

@@ -115,7 +115,7 @@ class _Ways:
         last = (turn.rows, np.arange(len(mass)))
         rows = sparse.csr_array((mass[:, 0], last), shape=(count, len(mass)))
         located = sum(chances, rows @ self._last)
-        earned = plans.worth(candidates_of(sets))[:, 0]
+        earned = plans.worth_of(sets)
         return spsolve(sparse.eye_array(count, format="csc") - located.tocsc(), earned)
 
     def proposed(self, policy: PolicyTable, value: Array) -> PolicyTable:
@@ -131,5 +131,5 @@ class _Ways:
     def gain(self, before: PolicyTable, after: PolicyTable, value: Array) -> Array:
         """`[keys]`, by how much the plans of `after` are worth more, with detections worth V."""
         plans = self.plans(value)
-        worth = [plans.worth(candidates_of(self.sets(each)))[:, 0] for each in (before, after)]
+        worth = [plans.worth_of(self.sets(each)) for each in (before, after)]
         return worth[1] - worth[0]

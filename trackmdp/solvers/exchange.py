@@ -121,9 +121,7 @@ def best_of(
         after = columns_of(plans.ascend(candidates_of(other), sweeps=10))
         # Where these are the plans at hand, exchange has been tried.
         tried = exchange(plans, after, rows_changed(plans.layout, policy.sets, after), go_on)
-        worth, other_worth = (
-            plans.worth(candidates_of(each))[:, 0] for each in (policy.sets, tried)
-        )
+        worth, other_worth = (plans.worth_of(each) for each in (policy.sets, tried))
         better = other_worth > worth + 1e-10 * (1.0 + np.abs(worth))
         sets = mixed(plans.layout, better, tried, policy.sets)
         policy = risen(policy, plans, sets) or policy
@@ -185,7 +183,7 @@ def could_gain(plans: Plans, policy: Found) -> BoolArray:
 
 def hopeful(plans: Plans, sets: Sequence[BoolArray], most: Array) -> BoolArray:
     """`[K]`, whether plans `sets` are worth less than `most` `[K]`."""
-    worth = plans.worth(candidates_of(sets))[:, 0]
+    worth = plans.worth_of(sets)
     return most - worth > 1e-9 * (1.0 + np.abs(worth))
 
 

@@ -18,7 +18,7 @@ from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation, pooled
 from trackmdp.solvers.linear import RenewalSystem
-from trackmdp.solvers.walk import Events, Passed, Step, Walk, all_events, passed, transition
+from trackmdp.solvers.walk import Events, Passed, Step, Walk, all_events, passed_last, transition
 from trackmdp.world.model import World
 from trackmdp.world.problem import Problem, modelled
 
@@ -52,7 +52,7 @@ def believed(problem: Problem, policy: PolicyTable, false_alarm: float) -> Evalu
     for ranked in _ranked(world, policy):
         found, mass = _reports(world, walk.move(), mass, policy, ranked, false_alarm)
         onward, gathered = onward + found.located, gathered + found.totals
-    last = passed(world, walk.move(), mass, 1.0, world.safe_cost, 0.0, m * m)[0]
+    last = passed_last(world, world.motion, walk.move(), mass, m * m)
     system = RenewalSystem(onward + last.located, world.size, direct=_DIRECT)
     gathered += last.totals
     totals = system.solve(gathered)

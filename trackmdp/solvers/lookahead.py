@@ -7,7 +7,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.types import Array, BoolArray
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked_table, valid
@@ -49,27 +49,28 @@ def solve(world: World, *, depth: int = 2, tail: Tail = "clocked") -> PolicyTabl
     renewal = Renewal(world, world.motion)
     sets: list[BoolArray] = []
     mass = np.ones(world.num_cells)
+    states: IndexArray = np.arange(world.num_cells)
     for n in range(world.num_choices):
         # the safe action ends every plan: n + ahead is at most t_max + 1
         ahead = min(depth, world.num_choices - n)
         # tails[:, n + ahead]: after `ahead` misses more the clock reads n + ahead, the column of the tail's value.
         detected, missed = world.reward + tails[:, 0], tails[:, n + ahead]
         problem = InnerProblem(renewal, detected, missed, ahead, first=n)
-        sets.append(_first_set(problem, mass))
+        sets.append(_first_set(problem, mass, states))
         report = renewal.choices[n].report(sets[-1][:, None])[:, 0]
-        mass = (mass @ renewal.steps[n].moves) * (1.0 - report)
+        mass, states = (mass @ renewal.steps[n].moves) * (1.0 - report), renewal.steps[n].states
     return renewal.table(sets)
 
 
-def _first_set(problem: InnerProblem, mass: Array) -> BoolArray:
-    """`[G]` the first set of the best plan from each located cell."""
+def _first_set(problem: InnerProblem, mass: Array, states: IndexArray) -> BoolArray:
+    """`[G]` the first set of the best plan from each located cell; `mass` `[E]` is undetected in `states` `[E]`."""
     world, run = problem.world, up_to(_MOST_NODES)
     known = tables(problem, slack=_SLACK, run=run)
     sets = first_guess(problem, known, mass)
     sets = exchange(problem.plans(mass), sets, np.ones(world.num_cells, dtype=bool))
     # One problem per located cell: its undetected mass after the sets carried out so far.
-    rows, states = problem.layout.rows[0], problem.states
-    here = sparse.csr_array((mass, (rows, states)), shape=(world.num_cells, world.num_cells))
+    place = problem.layout.rows[0], states
+    here = sparse.csr_array((mass, place), shape=(world.num_cells, world.num_cells))
     here.eliminate_zeros()
     tree = Tree(problem, known, problem.worth(sets, mass), _SLACK, here)
     run(tree)

@@ -303,8 +303,9 @@ class _Run:
         if listed is None:
             return False
         # e(x) = eps_x pays for every plan of x (see the module).
-        self.pay(np.maximum(listed.most - self.value, 0.0))
-        return self.use(renewal.table(listed.sets))
+        most, sets = listed
+        self.pay(np.maximum(most - self.value, 0.0))
+        return self.use(renewal.table(sets))
 
     def adopt(self, tree: Tree) -> bool:
         """Use the better plans that the tree has found; whether the policy is better with them."""

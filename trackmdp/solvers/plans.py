@@ -128,6 +128,10 @@ class Plans:
         start = self.undetected(1, sets[0], self.after(sets)[0])
         return self.layout.sums(0) @ (self.mass * start)
 
+    def worth_of(self, sets: Sequence[BoolArray]) -> Array:
+        """`[K]`, the same of one candidate, `[G]` for each step."""
+        return self.worth([on[:, None] for on in sets])[:, 0]
+
     def missing(self, t: int, on: AnyArray, mass: Array) -> Array:
         """`[E, C]`, the part of `mass` at step t that the set `on` leaves undetected."""
         return mass * (1.0 - self.turns[t - 1].choice.report(on))

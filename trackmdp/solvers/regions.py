@@ -138,11 +138,15 @@ def _predicted(world: World) -> float:
     rows, columns = (
         range(max(side - PATCH, 0) // 2, min(side + PATCH, 2 * side) // 2) for side in world.size
     )
-    patch = sub_world(world, (rows, columns))
-    return (
-        max(len(seen.rows) for seen in rules.predictions(patch, rules.clocked_policy(patch)))
-        / patch.num_cells
-    )
+    patch, entries = sub_world(world, (rows, columns)), list[int]()
+    rule = rules.clocked_rule(patch)
+
+    def counted(seen: rules.Prediction) -> rules.Offer:
+        entries.append(len(seen.rows))
+        return rule(seen)
+
+    rules.unroll(patch, counted)
+    return max(entries) / patch.num_cells
 
 
 def _region_bytes(world: World, side: int) -> int:

@@ -24,7 +24,7 @@ from trackmdp.sensing.task import Task
 from trackmdp.solvers.linear import DIRECT_CELLS, TOLERANCE, RenewalSystem
 from trackmdp.solvers.plans import Layout, Plans, Turn
 from trackmdp.solvers.value import event_groups, first_events, whole_renewals
-from trackmdp.solvers.walk import Events, Passed, Step, Walk, all_events, passed
+from trackmdp.solvers.walk import Events, Passed, Step, Walk, all_events, passed, passed_last
 from trackmdp.world.model import World
 
 _DIRECT = 1_500
@@ -129,11 +129,7 @@ class Renewal:
         for step, (report, spent) in zip(self.steps, acts, strict=False):
             now, mass = passed(task, step, mass, report, spent, 0.0, self.count)
             found.append(now)
-        last = self.steps[-1]
-        mass = np.concatenate([mass, np.ones(last.begun)])
-        safe = 1.0 if task.safe else task.safe_detection[self.motion.cell[last.states]]
-        found.append(passed(task, last, mass, safe, task.safe_cost, 0.0, self.count)[0])
-        return found
+        return [*found, passed_last(task, self.motion, self.steps[-1], mass, self.count)]
 
     def acts(self, sets: Sequence[AnyArray]) -> Iterator[Act]:
         """Reports and prices of `sets`, or of sensors that are on with such probabilities."""

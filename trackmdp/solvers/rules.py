@@ -7,7 +7,7 @@ cell alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -107,13 +107,18 @@ def clocked_policy(world: World) -> PolicyTable:
     Optimal, with sensors that never miss, wherever at most one cell of positive probability is left unsensed: then a
     miss reveals where the target is, as the bound assumes.
     """
+    return unroll(world, clocked_rule(world))
+
+
+def clocked_rule(world: World) -> Callable[[Prediction], Offer]:
+    """The rule of `clocked_policy`."""
     table = clocked_table(world).table
 
     def gains(seen: Prediction) -> Offer:
         credit = world.reward + table[seen.cells, 0] - table[seen.cells, seen.n + 1]
         return Offer(seen.mass * credit, world.prices, seen.inside)
 
-    return unroll(world, gains)
+    return gains
 
 
 def unroll(
@@ -123,7 +128,8 @@ def unroll(
 
     Cells of probability zero are never sensed, and after a miss that cannot happen nothing is.
     """
-    walk, mass, sensed = _walk(world), np.ones(world.num_cells), []
+    motion, mass, sensed = world.motion, np.ones(world.num_cells), []
+    walk = Walk(world, motion, all_events(world, world.remembering().keys, motion))
     for n in range(world.num_choices):
         step = walk.move()
         seen = _predicted(n, step, mass, world.num_cells)
@@ -140,23 +146,6 @@ def unroll(
             mass = mass * left
             walk.keep(left > 0)
     return PolicyTable.from_sensed(world.remembering(), sensed)
-
-
-def predictions(world: World, policy: PolicyTable) -> Iterator[Prediction]:
-    """The predictions after 0 ... t_max misses along the plans of a policy that remembers the cell alone."""
-    walk, mass, acts = _walk(world), np.ones(world.num_cells), policy.sensed_by(world)
-    for n in range(world.num_choices):
-        step = walk.move()
-        seen = _predicted(n, step, mass, world.num_cells)
-        yield seen
-        left = 1.0 - acts.reports(n, seen.rows, seen.cells)
-        mass = seen.mass * left
-        walk.keep(left > 0)
-
-
-def _walk(world: World) -> Walk:
-    motion = world.motion
-    return Walk(world, motion, all_events(world, world.remembering().keys, motion))
 
 
 def _predicted(n: int, step: Step, mass: Array, count: int) -> Prediction:

@@ -107,7 +107,7 @@ def risen(policy: Found, plans: Plans, sets: Sequence[BoolArray]) -> Found | Non
     moved = rows_changed(layout, old, sets)
     if not moved.any():
         return None
-    worth, other = (plans.worth(candidates_of(each))[:, 0] for each in (old, sets))
+    worth, other = (plans.worth_of(each) for each in (old, sets))
     gain = (other - worth) * _episodes(policy, plans)
     order = np.argsort(-gain, kind="stable")
     order = order[moved[order]]

@@ -34,7 +34,15 @@ from trackmdp.solvers.linear import (
     expected_steps,
     still_to_come,
 )
-from trackmdp.solvers.walk import Events, Passed, Walk, all_events, passed
+from trackmdp.solvers.walk import (
+    Events,
+    Passed,
+    Walk,
+    all_events,
+    detected_codes,
+    passed,
+    passed_last,
+)
 from trackmdp.world.model import World
 from trackmdp.world.problem import Problem
 
@@ -87,16 +95,9 @@ def _steps(task: Task, motion: Motion, events: Events, policy: SetTable) -> Iter
     walk, count = Walk(task, motion, events), len(events.codes)
     key = events.key
     mass = np.ones(count - events.forced)
-    spent, sensors = np.zeros(0), np.zeros(0)
-    for n in range(task.num_choices + 1):
+    for n in range(task.num_choices):
         step = walk.move()
-        cells = motion.cell[step.states]
-        if n == task.num_choices:
-            mass = np.concatenate([mass, np.ones(step.begun)])
-            report = 1.0 if task.safe else task.safe_detection[cells]
-            yield passed(task, step, mass, report, task.safe_cost, 0.0, count)[0]
-            return
-        report = policy.reports(n, key[step.rows], cells)
+        report = policy.reports(n, key[step.rows], motion.cell[step.states])
         spent, sensors = (
             policy.spent(n, each)[key] for each in (task.paid, task.available.astype(np.float64))
         )
@@ -105,6 +106,7 @@ def _steps(task: Task, motion: Motion, events: Events, policy: SetTable) -> Iter
         # Kept while the next one is made, it would be a tenth of the memory at a million cells.
         del found
         walk.keep(report < 1.0)
+    yield passed_last(task, motion, walk.move(), mass, count)
 
 
 def truncated_value(world: World, policy: PolicyTable, max_steps: int) -> Evaluation:
@@ -209,7 +211,7 @@ def first_events(events: Events, motion: Motion) -> IndexArray:
     """`[F]`, the event with which each of the F episodes starts."""
     keys, first = events.keys, motion.first
     key = keys.start(motion.cell[first], first % motion.modes)
-    return np.searchsorted(events.codes, first.astype(np.int64) * keys.num_keys + key)
+    return np.searchsorted(events.codes, detected_codes(keys, key, first))
 
 
 def event_groups(motion: Motion, states: IndexArray) -> IndexArray:

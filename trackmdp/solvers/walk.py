@@ -367,6 +367,13 @@ def passed(
     return Passed(onward, totals), now - found
 
 
+def passed_last(task: Task, motion: Motion, step: Step, mass: Array, count: int) -> Passed:
+    """The safe action after the free choices, which leave `mass` `[E_before - begun]` undetected; see `passed`."""
+    mass = np.concatenate([mass, np.ones(step.begun)])
+    report = 1.0 if task.safe else task.safe_detection[motion.cell[step.states]]
+    return passed(task, step, mass, report, task.safe_cost, 0.0, count)[0]
+
+
 def transition(value: Array, rows: IndexArray, columns: IndexArray, count: int) -> sparse.csr_array:
     """`[B, B]` of entries in order of their rows; those of 0 are left out."""
     some = value > 0

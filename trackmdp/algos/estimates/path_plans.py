@@ -206,7 +206,7 @@ def exchanged_keys(
         before.append(np.asarray(old[place]).ravel())
     ascended = columns_of(plans.ascend(candidates_of(before), sweeps=2))
     found = exchange(plans, ascended, np.ones(len(often), dtype=bool))
-    worth, other = (plans.worth(candidates_of(each))[:, 0] for each in (before, found))
+    worth, other = (plans.worth_of(each) for each in (before, found))
     gain = other - worth
 
     def changed(share: float) -> list[sparse.csr_array]:

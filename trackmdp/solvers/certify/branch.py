@@ -219,8 +219,7 @@ class Tree:
         if not len(some):
             return lost, added
         if frontier.after is None:
-            picked = choices.pick(some)
-            lost[some] = self._joint_loss(picked, picked.left)
+            lost[some] = self._joint_loss(choices.pick(some))
             return lost, added
         of = frontier.after, frontier.sets_left - 1
         lost[some], added[some] = self._joint.losses(
@@ -228,9 +227,9 @@ class Tree:
         )
         return lost, added
 
-    def _joint_loss(self, choices: Choices, left: BoolArray) -> Array:
-        """`[P]` lower bound on the loss of leaving the cells `left` unsensed against revealing the position at once."""
-        return self._loss(self._left_mass(choices, left), choices.frontier.sets_left - 1)
+    def _joint_loss(self, choices: Choices) -> Array:
+        """`[P]` lower bound on the loss of leaving the cells left unsensed against revealing the position at once."""
+        return self._loss(self._left_mass(choices), choices.frontier.sets_left - 1)
 
     def _loss(self, mass: sparse.csr_array, sets_left: int) -> Array:
         """`[P]` worth of `mass` with the position revealed at once, less its bound with one more set before that."""
@@ -283,12 +282,11 @@ class Tree:
         )
         return self._loss(mass, frontier.sets_left - 1)
 
-    def _left_mass(self, choices: Choices, left: BoolArray) -> sparse.csr_array:
-        _, cells, mass = replace(choices, left=left).left_cells()
-        pointer = np.concatenate([[0], np.cumsum(left.sum(axis=1))])
-        unsensed = sparse.csr_array(
-            (mass, cells, pointer), shape=(len(left), self._world.num_cells)
-        )
+    def _left_mass(self, choices: Choices) -> sparse.csr_array:
+        _, cells, mass = choices.left_cells()
+        pointer = np.concatenate([[0], np.cumsum(choices.left.sum(axis=1))])
+        shape = (len(choices.left), self._world.num_cells)
+        unsensed = sparse.csr_array((mass, cells, pointer), shape=shape)
         missed = choices.frontier.missed
         return unsensed if missed is None else unsensed + missed[choices.state]
 
@@ -321,7 +319,7 @@ class Tree:
         if not any(len(each.state) for each in batches):
             return
         sets_left = batches[0].frontier.sets_left - 1
-        mass = sparse.vstack([self._left_mass(each, each.left) for each in batches], format="csr")
+        mass = sparse.vstack([self._left_mass(each) for each in batches], format="csr")
         earned = (
             np.concatenate([each.relaxed for each in batches]) - mass @ self._revealed[sets_left]
         )
@@ -376,7 +374,7 @@ class Tree:
         frontier = replace(frontier, rest=self._least_loss(frontier), after=after)
         first = Choices.undecided(frontier, frontier.relaxed - frontier.rest[:, 0])
         if frontier.missed is not None:  # the missed mass has this loss under every choice
-            lost = self._joint_loss(first, first.left)
+            lost = self._joint_loss(first)
             first = replace(first, lost=lost, bound=first.bound - lost)
         self._push(replace(first, bound=np.minimum(first.bound, most[kept])))
 

@@ -5,17 +5,16 @@ Its keys are the cells, and the state of the target is its cell: branch and boun
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from trackmdp.arrays.types import Array, BoolArray, IndexArray
+from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.sensing.decisions import sensing
 from trackmdp.solvers.linear import forced_worth
-from trackmdp.solvers.plans import Layout, Plans, Turn
+from trackmdp.solvers.plans import Layout, Plans
 from trackmdp.solvers.renewal import Renewal
-from trackmdp.solvers.search import candidates_of, columns_of
 from trackmdp.world.model import World
 
 
@@ -51,14 +50,6 @@ class InnerProblem:
         """The problem."""
         return self.renewal.world
 
-    @property
-    def states(self) -> IndexArray:
-        """`[E]`, the cells of the entries before the first move."""
-        renewal = self.renewal
-        if self.first:
-            return renewal.steps[self.first - 1].states
-        return renewal.states[: len(renewal.plans)]
-
     @cached_property
     def layout(self) -> Layout:
         """Entries and decisions."""
@@ -67,7 +58,7 @@ class InnerProblem:
         if not self.windowed and self.world.window is not None:
             steps = self.renewal.steps[self.first : self.first + self.length]
             turns = [
-                Turn(turn.rows, turn.moves, turn.stay, choice, self.world.prices[choice.sensors])
+                replace(turn, choice=choice, price=self.world.prices[choice.sensors])
                 for turn, step in zip(turns, steps, strict=True)
                 for choice in [sensing(self.world, step.rows, step.states, whole.count)]
             ]
@@ -90,12 +81,4 @@ class InnerProblem:
 
     def worth(self, sets: list[BoolArray], mass: Array | None = None) -> Array:
         """`[M]`, worth of the plans `sets` `[G]` from each located cell."""
-        return self.plans(mass).worth(candidates_of(sets))[:, 0]
-
-    def guess(self, credit: list[Array], mass: Array | None = None) -> list[BoolArray]:
-        """Sets found by a homotopy from `credit` to the exact credit; see `search`."""
-        plans = self.plans(mass, credit)
-        sets = plans.none()
-        for optimism in np.linspace(1.0, 0.0, 11):
-            sets = plans.ascend(sets, sweeps=3, optimism=float(optimism))
-        return columns_of(sets)
+        return self.plans(mass).worth_of(sets)

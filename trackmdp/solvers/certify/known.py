@@ -12,6 +12,7 @@ from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.solvers.certify.branch import Tree
 from trackmdp.solvers.certify.delayed import Delayed
 from trackmdp.solvers.certify.inner import InnerProblem
+from trackmdp.solvers.search import columns_of
 
 
 def first_guess(
@@ -20,7 +21,11 @@ def first_guess(
     """Sets found by a homotopy from the credit r + V - R, `known` being R_0 ... R_{H-1}; see `search`."""
     # With H sets, after set t there are H - 1 - t left: credit_t(j) = r + V(j) - R_{H-1-t}(j).
     credit = [problem.detected - known[problem.length - 1 - t] for t in range(problem.length)]
-    return problem.guess(credit, mass)
+    plans = problem.plans(mass, credit)
+    sets = plans.none()
+    for optimism in np.linspace(1.0, 0.0, 11):
+        sets = plans.ascend(sets, sweeps=3, optimism=float(optimism))
+    return columns_of(sets)
 
 
 def tables(

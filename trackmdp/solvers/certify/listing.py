@@ -30,22 +30,9 @@ _MOST_PATTERNS = 2**22
 """Choices of all rows; as sets of cells covered, 32 MB of prices."""
 
 
-@dataclass(frozen=True)
-class Listed:
-    """The outcome of a listing.
-
-    Attributes:
-        most: `[K]`, proved: no plan is worth more.
-        sets: `[G]` for each step, the plans at hand or better ones.
-    """
-
-    most: Array
-    sets: list[BoolArray]
-
-
 def best_plans(
     plans: Plans, sets: list[BoolArray], slack: float, revealed: Array, go_on: Callable[[int], bool]
-) -> Listed | None:
+) -> tuple[Array, list[BoolArray]] | None:
     """All plans of all rows.
 
     Args:
@@ -56,12 +43,13 @@ def best_plans(
         go_on: takes the number of plans looked at since it was asked last; whether to go on.
 
     Returns:
-        None where there are too many choices, or `go_on` ended the listing.
+        `[K]` proved: no plan is worth more; and `[G]` for each step, the plans at hand or better ones. None where there
+        are too many choices, or `go_on` ended the listing.
     """
     first = _choices(plans)
     if first is None:
         return None
-    worth = plans.worth([on[:, None] for on in sets])[:, 0]
+    worth = plans.worth_of(sets)
     most, best = worth + slack, np.full(len(worth), -1)
     for number in range(first.count):
         tried = first.of(number)
@@ -74,15 +62,11 @@ def best_plans(
         reached = earned + _last(plans, mass, hopeful)
         better = hopeful & (reached > most)
         most, best = np.where(better, reached, most), np.where(better, number, best)
-    return Listed(most, _plans_of(plans, sets, first, best))
+    return most, _plans_of(plans, sets, first, best)
 
 
-@dataclass(frozen=True)
-class _Tried:
-    """A choice of all listed sets: reports `[E]` of each step, and prices `[K]` relative to the mass in the grid."""
-
-    report: list[Array]
-    price: list[Array]
+_Tried: TypeAlias = tuple[list[Array], list[Array]]
+"""A choice of all listed sets: reports `[E]` of each step, and prices `[K]` relative to the mass in the grid."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +88,7 @@ def _choices(plans: Plans) -> _Choices | None:
     turns = plans.turns[:-1]
     choices = [turn.choice for turn in turns]
     if not turns:
-        return _Choices(1, lambda _: _Tried([], []), lambda _: [])
+        return _Choices(1, lambda _: ([], []), lambda _: [])
     first = choices[0]
     if not (isinstance(first, Shared) and first.perfect):
         return _of_sensors(plans)
@@ -134,7 +118,7 @@ def _of_sensors(plans: Plans) -> _Choices | None:
         for t, on in enumerate(sets(np.full(plans.layout.count, number)), start=1):
             report.append(plans.turns[t - 1].choice.report(on[:, None])[:, 0])
             price.append(plans.layout.pay(t) @ on)
-        return _Tried(report, price)
+        return report, price
 
     return _Choices(count, of, sets)
 
@@ -189,7 +173,7 @@ def _of_patterns(plans: Plans, choice: Shared) -> _Choices | None:
     cheapest = _cheapest(choice.some(kept), turn.price[kept], number, 2**bits)
 
     def of(pattern: int) -> _Tried:
-        return _Tried([((pattern >> number) & 1).astype(np.float64)], [cheapest[:, pattern]])
+        return [((pattern >> number) & 1).astype(np.float64)], [cheapest[:, pattern]]
 
     def sets(numbers: IndexArray) -> list[BoolArray]:
         # The cheapest set that sees a pattern: seeing an entry of it is worth more than all prices, any other a loss as
@@ -224,7 +208,7 @@ def _cheapest(choice: Shared, price: Array, number: IndexArray, patterns: int) -
 def _earned(plans: Plans, tried: _Tried) -> tuple[Array, Array]:
     """`[K]` reward of the listed sets, and `[E]` the mass that they leave undetected."""
     earned, mass = np.zeros(plans.layout.count), plans.mass[:, 0]
-    for t, (report, price) in enumerate(zip(tried.report, tried.price, strict=True), start=1):
+    for t, (report, price) in enumerate(zip(*tried, strict=True), start=1):
         now = plans.turns[t - 1].back @ mass
         sums = plans.layout.sums(t)
         inside = sums @ now
