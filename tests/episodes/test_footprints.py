@@ -68,7 +68,9 @@ def test_a_log_is_simulated_again_to_the_bit_and_recovered(tmp_path: Path) -> No
         assert mixed is not None
         assert world.coverage is not None
         # All d sensors of a cell are off in C(4 - d, 2) of the C(4, 2) = 6 pairs.
-        assert mixed[0] == pytest.approx(1 - comb(4 - world.coverage.degree, 2) / 6)
+        assert mixed[0] == pytest.approx(
+            1 - comb(4 - np.diff(world.coverage.by_cell.indptr), 2) / 6
+        )
         assert reader[0]["action"].shape[1] == 4
         whole = [reader.read(row["episode"]) for row in reader.rows]
     cut = tmp_path / "cut.mcap"

@@ -48,7 +48,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
 @pytest.fixture(scope="module")
 def openings() -> Openings:
     every = [candidate for z in (3, 4, 5) for candidate in candidates(z, seeds=range(2))]
-    return Openings(every, list(sensitivity(draws=[0])), checks(39, border="renormalize", t_max=1))
+    return Openings(every, list(sensitivity(draws=[0])), checks(39))
 
 
 @pytest.fixture(scope="module")

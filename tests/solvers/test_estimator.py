@@ -63,7 +63,7 @@ def test_both_forms_by_hand() -> None:
     np.testing.assert_allclose(estimate.belief, [0.5, 0.3])
     np.testing.assert_allclose(estimate.exact, [0.5, 0.3])
     np.testing.assert_allclose(estimate.paper, [0.5 + 0.9 * 0.2, 0.3 + 0.9 * 0.2])
-    scored = estimator.accuracy(world, table)
+    scored = estimator.accuracy(world, table, evaluate(world, table).value)
     assert scored.missed_per_episode == pytest.approx(0.25 * 0.8)
     assert scored.bayes == pytest.approx(0.5 / 0.8)
 
@@ -72,7 +72,8 @@ def test_accuracy_on_missed_steps() -> None:
     """Missed steps are those of the exact evaluation; the exact form is as good as the belief, the paper's is not."""
     world = paper_world(5, 0.22, 2)
     chains = rules.qmdp(world)
-    scored, exact = estimator.accuracy(world, chains), evaluate(world, chains)
+    exact = evaluate(world, chains)
+    scored = estimator.accuracy(world, chains, exact.value)
     assert scored.missed_per_episode == pytest.approx((exact.steps - exact.detections).mean())
     assert scored.exact == pytest.approx(scored.bayes, abs=1e-9)
     assert scored.paper < scored.bayes - 0.01
@@ -81,7 +82,8 @@ def test_accuracy_on_missed_steps() -> None:
 
 def test_nothing_missed_is_all_right() -> None:
     world = paper_world(5, 0.16, 0)
-    scored = estimator.accuracy(world, PolicyTable.all_on(world))
+    table = PolicyTable.all_on(world)
+    scored = estimator.accuracy(world, table, evaluate(world, table).value)
     assert (scored.paper, scored.exact, scored.bayes, scored.missed_per_episode) == (
         1.0,
         1.0,

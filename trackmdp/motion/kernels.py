@@ -17,6 +17,7 @@ from trackmdp.arrays.entries import ones_at
 from trackmdp.arrays.files import read_matrix
 from trackmdp.arrays.rows import merged, pairwise_row_sums
 from trackmdp.arrays.types import Array, BoolArray, Indices
+from trackmdp.grid.displacements import cell_at
 from trackmdp.grid.size import Size, grid_size
 from trackmdp.motion.kernel_checks import canonical_kernel
 
@@ -57,7 +58,7 @@ def random_support(
         count = np.full(len(cells), support_size)
         if border == "inside":
             # Only positions in the grid count: they go first, in the order drawn.
-            inside = _in_grid(grid, cells[:, None], window[order])
+            inside = _moved(grid, cells, window[order], clip=False)[1]
             order = np.take_along_axis(order, np.argsort(~inside, axis=1, kind="stable"), axis=1)
             count = np.minimum(inside.sum(axis=1), support_size)
         blocks.append(
@@ -140,9 +141,19 @@ def _one_low(count: int, low: float, exit_probability: float) -> Array:
     return np.array([low] + [rest] * (count - 1))
 
 
-def _in_grid(grid: tuple[int, int], cells: Indices, offsets: _Offsets) -> BoolArray:
-    position = np.stack(np.divmod(cells, grid[1]), axis=-1) + offsets
-    return np.all((position >= 0) & (position < grid), axis=-1)
+def _moved(
+    grid: tuple[int, int], cells: Indices, offsets: _Offsets, *, clip: bool
+) -> tuple[Indices, BoolArray]:
+    """`[B, K]` the cells at `offsets` `[B, K, 2]` from `cells` `[B]`, and whether they are in the grid."""
+    row, column = (
+        place[:, None] + offset
+        for place, offset in zip(
+            np.divmod(cells, grid[1]), np.moveaxis(offsets, -1, 0), strict=True
+        )
+    )
+    if clip:
+        row, column = row.clip(0, grid[0] - 1), column.clip(0, grid[1] - 1)
+    return cell_at(grid, row, column)
 
 
 def _place(
@@ -158,14 +169,10 @@ def _place(
     Positions outside are treated by the rule `border`; with `renormalize` and `inside` a row still sums to its entry of
     `totals` `[B]`, and where they leave no position at all the target stays.
     """
-    position = np.stack(np.divmod(cells, grid[1]), axis=-1)[:, None] + offsets
-    if border == "clip":
-        position = position.clip(0, np.array(grid) - 1)
+    target, inside = _moved(grid, cells, offsets, clip=border == "clip")
     # A weight of 0 makes no entry: the padding of rows with fewer positions, above all.
-    inside = ((position >= 0) & (position < grid)).all(axis=-1) & (weights != 0)
-    row = np.nonzero(inside)[0]
-    # (row, column) . (columns, 1) = row * columns + column, the cell's number.
-    target = position[inside] @ (grid[1], 1)
+    inside &= weights != 0
+    row, target = np.nonzero(inside)[0], target[inside]
     # Entries of one place are added up in the order given: `lexsort` is stable, SciPy's `sum_duplicates` is not.
     order = np.lexsort((target, row))
     row, target, total = merged(row[order], target[order], weights[inside][order])

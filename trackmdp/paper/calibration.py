@@ -165,14 +165,14 @@ def compute(say: Callable[[str], None]) -> Openings:
     say("the paper's unstated settings")
     settings = list(sensitivity())
     say("the paper's theorems")
-    found = checks(chosen(every)[HARDEST], border=BORDER, t_max=T_MAX)
+    found = checks(chosen(every)[HARDEST])
     # Through the stored form even now: a report made from `paper.json` later has to give the same bytes as this one.
     return _unpacked(_packed(Openings(every, settings, found)))
 
 
-def checks(seed: int, *, border: str, t_max: int) -> list[Check]:
+def checks(seed: int) -> list[Check]:
     """The paper's theorems on the world with Z = 5 at the lowest price, and the two remarks."""
-    world = paper_world(paper_kernel(HARDEST, seed, border), COSTS[0], t_max)  # type: ignore[arg-type]
+    world = paper_world(paper_kernel(HARDEST, seed, BORDER), COSTS[0], T_MAX)
     solution = optimal.solve(world, tolerance=TOLERANCE)
     return [
         *theorems.check_theorems(world, solution, TOLERANCE),
@@ -220,17 +220,9 @@ def _unpacked(plain: dict[str, Any]) -> Openings:
     return Openings(
         [Candidate(*row) for row in plain["candidates"]],
         [
-            Setting(
-                border,
-                t_max,
-                z,
-                cost,
-                Spread(*accuracy),
-                Spread(*qmdp),
-                Spread(*clocked),
-                deviation,
-            )
-            for border, t_max, z, cost, accuracy, qmdp, clocked, deviation in plain["settings"]
+            Setting(*at, *spreads, deviation)
+            for *at, accuracy, qmdp, clocked, deviation in plain["settings"]
+            for spreads in [(Spread(*accuracy), Spread(*qmdp), Spread(*clocked))]
         ],
         [
             Check(name, statement, float(deviation), *rest)

@@ -85,11 +85,6 @@ class Coverage:
         """`[M, S]`, the sensors that cover each cell."""
         return self.matrix.T.tocsr()
 
-    @cached_property
-    def degree(self) -> npt.NDArray[np.int64]:
-        """`[M]`, how many sensors cover each cell; 0 where only the safe action locates the target."""
-        return np.diff(self.by_cell.indptr).astype(np.int64)
-
     def as_lists(self) -> list[list[int]]:
         """The cells of each sensor."""
         return [part.tolist() for part in np.split(self.matrix.indices, self.matrix.indptr[1:-1])]

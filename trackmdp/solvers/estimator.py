@@ -18,7 +18,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.certify.inner import InnerProblem
 from trackmdp.solvers.certify.known import tables, up_to
 from trackmdp.solvers.renewal import Renewal
-from trackmdp.solvers.value import key_visits, value_of
+from trackmdp.solvers.value import key_visits
 from trackmdp.solvers.walk import Step
 from trackmdp.world.model import World
 
@@ -83,18 +83,17 @@ def positions(world: World, policy: PolicyTable, value: Array) -> list[PositionE
     return estimates
 
 
-def accuracy(world: World, policy: PolicyTable, value: Array | None = None) -> EstimatorAccuracy:
+def accuracy(world: World, policy: PolicyTable, value: Array) -> EstimatorAccuracy:
     """How often the estimates are right on missed steps, pooled over a uniform start.
 
     Args:
         world: the problem.
         policy: the one that senses.
-        value: `[M]`, V of the Q-values; the policy's own where not given.
+        value: `[M]`, V of the Q-values.
     """
-    own = value_of(world, policy).value if value is None else value
     visits = key_visits(world, policy)
     missed, right = 0.0, np.zeros(3)
-    for estimate in positions(world, policy, own):
+    for estimate in positions(world, policy, value):
         # Expected number of such misses per episode: renewals in the row's cell, times the joint probability within
         # one.
         weight = visits[estimate.rows] * estimate.missed

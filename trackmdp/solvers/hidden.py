@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from operator import attrgetter
 from typing import TypeAlias
 
 import numpy as np
+from scipy import sparse
 
+from trackmdp.arrays.entries import per_row, summing
 from trackmdp.arrays.types import AnyArray
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
@@ -22,10 +25,10 @@ from trackmdp.solvers import optimal
 from trackmdp.solvers.annealing import anneal
 from trackmdp.solvers.certify.budget import Budget
 from trackmdp.solvers.exchange import exchanged, other_starts
+from trackmdp.solvers.linear import accumulate
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found, clocked_sets, follow_credit, mixed
-from trackmdp.solvers.solution import SearchProgress, Solution
-from trackmdp.solvers.value import averaged_kernel, value_of
+from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
 from trackmdp.world.model import World
 
 _STEPS, _SWEEPS = 12, 1
@@ -83,13 +86,10 @@ def solve(
             search.run(start=start)
     except KeyboardInterrupt:
         interrupted = True
-    table = search.table
-    evaluation = value_of(world, table)
-    bound = np.maximum(best.bound, evaluation.value)
-    gap = float((bound - evaluation.value).mean())
-    certified = gap <= tolerance * max(1.0, abs(evaluation.aihtr))
-    seconds, late = time.monotonic() - began, budget.timed_out and not certified
-    return Solution(table, evaluation, bound, certified, seconds, best.nodes, interrupted, late)
+    seconds = time.monotonic() - began
+    found = bracketed(world, search.table, seconds, best.bound, tolerance)
+    late = budget.timed_out and not found.certified
+    return replace(found, nodes=best.nodes, interrupted=interrupted, timed_out=late)
 
 
 def _watching(
@@ -261,8 +261,15 @@ def revealing(world: World) -> World:
 
 
 def averaged(world: World) -> World:
-    """The motion to a tracker that knows of no modes: each cell's moves, averaged over its modes as they occur."""
+    """The motion to a tracker that knows of no modes: each cell's moves, averaged over its modes as they occur.
+
+    Sensing does not move the target, so the expected visits (I - Q^T)^-1 s of an episode are the same for all policies.
+    """
     if world.modes == 1:
         return world
-    kernel = averaged_kernel(world.motion, world.num_cells)
+    cell, states = world.motion.cell, world.num_states
+    visits = accumulate(sparse.csr_array(world.kernel.T), np.full(states, 1.0 / states))
+    share = visits / per_row(cell, visits, world.num_cells)[cell]
+    of_cell = summing(cell, world.num_cells)
+    kernel = of_cell @ sparse.diags_array(share) @ world.kernel @ of_cell.T.tocsr()
     return World.of(world, kernel, memory="cell", revealed=1, markov=True)

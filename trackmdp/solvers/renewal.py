@@ -45,11 +45,11 @@ class Renewal:
 
     Args:
         task: sensors, prices and limits.
-        motion: of the target; None: the task's, which is a world then.
-        keys: of the policies; None: the task's.
+        motion: of the target.
 
     Attributes:
-        task, motion, keys: as given.
+        task, motion: as given.
+        keys: of the policies.
         steps: the free choices, and last the safe action.
         plans: `[K]`, the keys that can occur.
         owner: `[B]`, place in `plans` of the key of each event.
@@ -58,9 +58,9 @@ class Renewal:
         UserError: there is not enough memory for it.
     """
 
-    def __init__(self, task: Task, motion: Motion, keys: KeySpace | None = None) -> None:
+    def __init__(self, task: Task, motion: Motion) -> None:
         self.task, self.motion = task, motion
-        self.keys = task.keys if keys is None else keys
+        self.keys: KeySpace = task.keys
         self.events = all_events(task, self.keys, motion)
         check_room(task, motion, self.events)
         walk = Walk(task, motion, self.events)
@@ -154,10 +154,6 @@ class Renewal:
         """`[B]` V of a policy; `guess` is where an iteration begins."""
         system, earned = self.system(sets, guessed=guess is not None)
         return system.solve(earned, guess)
-
-    def mean(self, value: Array) -> float:
-        """The AIHTR of a `value` `[B]`."""
-        return float(value[self.first].mean())
 
     def problem(
         self, value: Array, weight: Array | None = None, credit: Sequence[Array] | None = None

@@ -18,7 +18,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.sensing.choose import TIE
 from trackmdp.sensing.decisions import sensing
 from trackmdp.solvers.bounds import clocked_table
-from trackmdp.solvers.walk import Step, Walk, all_events
+from trackmdp.solvers.walk import Walk, all_events
 from trackmdp.world.model import World
 
 
@@ -132,7 +132,10 @@ def unroll(
     walk = Walk(world, motion, all_events(world, world.remembering().keys, motion))
     for n in range(world.num_choices):
         step = walk.move()
-        seen = _predicted(n, step, mass, world.num_cells)
+        before, now = per_row(step.before, mass, world.num_cells), mass @ step.moves
+        inside = per_row(step.rows, now, world.num_cells)
+        # Joint with the misses, not conditioned on them.
+        seen = Prediction(n, step.rows, step.states, now, before, inside)
         offer = rule(seen)
         located = None if world.window is None else np.arange(world.num_cells)
         choice = sensing(world, seen.rows, seen.cells, world.num_cells, located, distinct=True)
@@ -140,18 +143,12 @@ def unroll(
         price = offer.price[choice.sensors] * offer.charge[choice.rows] * slack
         on = choice.best(offer.gain[:, None], price[:, None])
         sensed.append((choice.rows[on[:, 0]], choice.sensors[on[:, 0]]))
-        mass = seen.mass
+        mass = now
         if learns:
             left = 1.0 - choice.report(on)[:, 0]
             mass = mass * left
             walk.keep(left > 0)
     return PolicyTable.from_sensed(world.remembering(), sensed)
-
-
-def _predicted(n: int, step: Step, mass: Array, count: int) -> Prediction:
-    """The prediction from undetected `mass` `[E_before]`; joint with the misses, not conditioned on them."""
-    before, now = per_row(step.before, mass, count), mass @ step.moves
-    return Prediction(n, step.rows, step.states, now, before, per_row(step.rows, now, count))
 
 
 def _offer(world: World, seen: Prediction, charged: Array) -> Offer:

@@ -65,7 +65,7 @@ class Found:
         self.system, self._earned = renewal.system(sets, guessed=self._guess is not None)
         self.visits: Array | None = None
         if renewal.single:
-            self.aihtr = renewal.mean(self.value)
+            self.aihtr = float(self.value[renewal.first].mean())
             return
         # The visits alone give the mean value: many policies are judged by it, and few are kept.
         known = near.visits if isinstance(near, Found) else None

@@ -112,11 +112,15 @@ class SearchProgress:
 
 
 def bracketed(
-    world: World, table: PolicyTable, seconds: float, tolerance: float = 1e-6
+    world: World,
+    table: PolicyTable,
+    seconds: float,
+    bound: Array | None = None,
+    tolerance: float = 1e-6,
 ) -> Solution:
-    """A policy found in another way, in `seconds`, with the clocked bound as the proved one."""
+    """A policy found in another way, in `seconds`, under a proved `bound` `[M]`, by default the clocked one."""
     evaluation = value_of(world, table, per_cell=False)
-    bound = np.maximum(clocked(world), evaluation.value)
+    bound = np.maximum(clocked(world) if bound is None else bound, evaluation.value)
     gap = float((bound - evaluation.value).mean()) + evaluation.error
     certified = gap <= tolerance * max(1.0, abs(evaluation.aihtr))
     return Solution(table, evaluation, bound, certified, seconds, nodes=0, interrupted=False)

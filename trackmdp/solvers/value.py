@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.entries import per_row, summing
+from trackmdp.arrays.entries import per_row
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.motion.chain import Motion
@@ -29,7 +29,6 @@ from trackmdp.solvers.linear import (
     DIRECT_CELLS,
     Levels,
     RenewalSystem,
-    accumulate,
     check_length,
     expected_steps,
     still_to_come,
@@ -282,18 +281,6 @@ def check_revealed(motion: Motion, policy: PolicyTable) -> None:
         raise UserError(
             f"policy: made for targets with {policy.task.revealed} modes; expected {motion.modes}"
         )
-
-
-def averaged_kernel(motion: Motion, num_cells: int) -> sparse.csr_array:
-    """`[M, M]` moves of each cell, averaged over its modes as they occur: the motion to a tracker without modes.
-
-    Sensing does not move the target, so the expected visits (I - Q^T)^-1 s of an episode are the same for all policies.
-    """
-    start = np.bincount(motion.first, minlength=motion.num_states) / len(motion.first)
-    visits = accumulate(sparse.csr_array(motion.moves.T), start)
-    share = visits / per_row(motion.cell, visits, num_cells)[motion.cell]
-    of_cell = summing(motion.cell, num_cells)
-    return of_cell @ sparse.diags_array(share) @ motion.moves @ of_cell.T.tocsr()
 
 
 def as_table(problem: Problem, policy: PolicyLike | Array | BoolArray) -> PolicyTable:

@@ -30,9 +30,6 @@ from trackmdp.memory.keys import KeySpace
 from trackmdp.motion.chain import Motion
 from trackmdp.sensing.task import Task
 
-FIGURES = ("reward", "steps", "detections", "sensors", "safe actions", "length")
-"""Totals of an episode, in the order of the columns of `Passed.totals`; `steps` are those in the grid."""
-
 
 @dataclass(frozen=True, eq=False)
 class Events:
@@ -320,7 +317,7 @@ class Passed:
 
     Attributes:
         located: `[B, B]`, probability that this step ends a renewal, and with which event.
-        totals: `[B, 6]`, expected `FIGURES` of this step.
+        totals: `[B, 6]`, expected reward, steps in the grid, detections, sensors on, safe actions and steps.
     """
 
     located: sparse.csr_array

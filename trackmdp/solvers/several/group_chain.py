@@ -45,13 +45,13 @@ class Chain:
     moves: sparse.csr_array
 
 
-def joint_chain(rule: Rule, most: int = MOST_STATES) -> Array | None:
+def joint_chain(rule: Rule) -> Array | None:
     """`[1, 6]` exact expected totals of a policy from a uniform start.
 
     None where there are more joint states, or the policy remembers more than beliefs.
     """
     group = rule.group
-    if group.task.num_cells ** len(group) > most or rule.reads_history:
+    if group.task.num_cells ** len(group) > MOST_STATES or rule.reads_history:
         return None
 
     def choices(joint: Joint) -> list[IndexArray]:
@@ -62,7 +62,7 @@ def joint_chain(rule: Rule, most: int = MOST_STATES) -> Array | None:
         present = np.array([[known is not None for known in joint]])
         return [rule.sets(Clocks(located, misses, present), beliefs.moved(group))]
 
-    chain = explored(group, choices, most)
+    chain = explored(group, choices, MOST_STATES)
     if chain is None:
         return None
     if group.task.max_steps is None:
