@@ -220,9 +220,17 @@ def _unpacked(plain: dict[str, Any]) -> Openings:
     return Openings(
         [Candidate(*row) for row in plain["candidates"]],
         [
-            Setting(*at, *spreads, deviation)
-            for *at, accuracy, qmdp, clocked, deviation in plain["settings"]
-            for spreads in [(Spread(*accuracy), Spread(*qmdp), Spread(*clocked))]
+            Setting(
+                border,
+                t_max,
+                z,
+                cost,
+                Spread(*accuracy),
+                Spread(*qmdp),
+                Spread(*clocked),
+                deviation,
+            )
+            for border, t_max, z, cost, accuracy, qmdp, clocked, deviation in plain["settings"]
         ],
         [
             Check(name, statement, float(deviation), *rest)
