@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 import trackmdp as tm
+from tests.solvers.worlds import searched
 from trackmdp.algos import joint_trials
 from trackmdp.algos.joint_trials import tried
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import search
 
 WALK = tm.make_world("random_walk", size=4).but(cost=0.4, safe_cost=None)
 """Leaving a neighbour out at n = 0 pays only if n = 1 looks where the target then is."""
@@ -45,7 +45,7 @@ def after(table: PolicyTable, each: int = 1000, discount: float = 0.95) -> Polic
 
 def test_sets_that_have_to_change_together_do() -> None:
     """Ascent ends .05 per step below the optimum."""
-    stuck, best = search.solve(WALK), worth(tm.solve(WALK).table)
+    stuck, best = searched(WALK), worth(tm.solve(WALK).table)
     assert worth(stuck) < best - 0.04
     assert best - 0.02 < worth(after(stuck)) <= best + 1e-12
 

@@ -7,9 +7,9 @@ import itertools
 import numpy as np
 import pytest
 
-from tests.solvers.worlds import all_plans, best_of_all, paper_world, random_tiny_world
+from tests.solvers.worlds import all_plans, best_of_all, paper_world, random_tiny_world, searched
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import bounds, optimal, search
+from trackmdp.solvers import bounds, optimal
 from trackmdp.solvers.certify import delayed
 from trackmdp.solvers.certify.branch import Tree
 from trackmdp.solvers.certify.inner import InnerProblem
@@ -29,7 +29,7 @@ def _to_the_end(tree: Tree) -> None:
 def _tree() -> tuple[Tree, np.ndarray, np.ndarray]:
     """The renewals of the policy that the homotopy finds at Z = 5, c = 0.22, t_max = 2: some can be improved."""
     world = paper_world(5, 0.22, 2)
-    value = evaluate(world, search.solve(world)).value
+    value = evaluate(world, searched(world)).value
     problem = InnerProblem.of(Renewal(world, world.motion), value)
     known = tables(problem, slack=1e-9, run=_to_the_end)
     tree = Tree(problem, known, value, 1e-9)

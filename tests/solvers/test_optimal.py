@@ -16,12 +16,13 @@ from tests.solvers.worlds import (
     best_of_all,
     paper_world,
     reference_world,
+    searched,
     tiny_worlds,
 )
 from trackmdp.arrays.types import BoolArray
 from trackmdp.motion.kernels import drift, random_walk
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import bounds, optimal, search
+from trackmdp.solvers import bounds, optimal
 from trackmdp.solvers.certify import delayed
 from trackmdp.solvers.certify.inner import InnerProblem
 from trackmdp.solvers.evaluate import evaluate
@@ -78,7 +79,7 @@ def test_every_chain_of_a_3x3_world_tried(world: World) -> None:
 
 @given(tiny_worlds(most_t_max=2))
 def test_the_search_ends_where_no_single_set_can_be_improved(world: World) -> None:
-    table = search.solve(world)
+    table = searched(world)
     value = evaluate(world, table).value
     renewal = Renewal(world, world.motion)
     sets = renewal.sets(table)
@@ -93,8 +94,8 @@ def test_the_search_ends_where_no_single_set_can_be_improved(world: World) -> No
 def test_the_homotopy_finds_sets_that_have_to_change_together() -> None:
     """Z = 5, c = 0.22, t_max = 1: ascent from the clocked sets ends lower, the homotopy at the optimum."""
     world = paper_world(5, 0.22, 1)
-    abrupt = search.solve(world, steps=1)
-    gradual = search.solve(world)
+    abrupt = searched(world, steps=1)
+    gradual = searched(world)
     assert evaluate(world, abrupt).aihtr < 89.9 < evaluate(world, gradual).aihtr
     assert evaluate(world, gradual).aihtr == pytest.approx(89.98088602712643, abs=1e-9)
 

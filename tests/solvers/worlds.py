@@ -14,6 +14,9 @@ from hypothesis import strategies as st
 from tests.solvers.chain import choosable, sees
 from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.motion.kernels import random_support
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.renewal import Renewal
+from trackmdp.solvers.search import led
 from trackmdp.world.model import World
 
 REFERENCES: list[dict[str, Any]] = json.loads(
@@ -22,6 +25,11 @@ REFERENCES: list[dict[str, Any]] = json.loads(
 PAPER_REFERENCES: list[dict[str, Any]] = json.loads(
     (Path(__file__).parents[1] / "data" / "paper_pairs.json").read_text(encoding="utf-8")
 )
+
+
+def searched(world: World, steps: int = 30) -> PolicyTable:
+    """The policy of the homotopy, before exchange."""
+    return led(Renewal(world, world.motion), steps=steps).table
 
 
 def reference_world(reference: dict[str, Any]) -> World:

@@ -127,9 +127,7 @@ def _window(radius: int) -> _Offsets:
 def _blocks(grid: tuple[int, int]) -> list[_Offsets]:
     """All cells in order, some at a time."""
     m = grid[0] * grid[1]
-    return [
-        np.arange(begin, min(begin + _CELLS_AT_ONCE, m)) for begin in range(0, m, _CELLS_AT_ONCE)
-    ]
+    return np.split(np.arange(m), range(_CELLS_AT_ONCE, m, _CELLS_AT_ONCE))
 
 
 def _one_low(count: int, low: float, exit_probability: float) -> Array:

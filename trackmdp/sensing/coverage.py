@@ -60,13 +60,7 @@ class Coverage:
         if len(empty):
             raise UserError(f"coverage: sensor {empty[0]} covers no cell, expected at least one")
         # Sensor s covers cell s alone: nothing is left to do for a coverage, and nothing may cost time or a bit.
-        own = np.arange(cells)
-        if (
-            matrix.shape == (cells, cells)
-            and matrix.nnz == cells
-            and np.array_equal(matrix.indices, own)
-            and (matrix.data == 1.0).all()
-        ):
+        if matrix.shape[0] == cells and not (matrix != sparse.eye_array(cells, format="csr")).nnz:
             return None
         return given if isinstance(given, Coverage) else cls(matrix)
 

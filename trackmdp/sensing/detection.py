@@ -35,9 +35,11 @@ class Detection:
         self._window = Window(task, None, device) if everywhere else Window.of(task, device)
         self._covering: Tensor | None = None
         if task.coverage is not None:
-            self._covering, misses = _sensors_by_cell(task)
-            self._covering = self._covering.to(device)
-            self._misses = misses.to(device)
+            # [M + 1, d] sensors that cover each cell, padded with S, and the probabilities that they miss: three cells
+            # covered by sensors 0, by 0 and 1, and by none of two give, with the exit, 0 2, 0 1, 2 2, 2 2.
+            sensors, chance = padded_rows(task.sees_by_cell, task.total_sensors, more=1)
+            self._covering = torch.as_tensor(sensors, device=device)
+            self._misses = torch.as_tensor(1.0 - chance, device=device)
         elif not self.perfect:
             # Cell M, where a target is after its exit, is seen by no sensor.
             self._detection = torch.as_tensor(np.append(task.detection, 0.0), device=device)
@@ -69,12 +71,3 @@ class Detection:
         if self.perfect or self._covering is not None:
             return covered
         return covered * self._detection.index_select(0, cell)
-
-
-def _sensors_by_cell(task: Task) -> tuple[Tensor, Tensor]:
-    """`[M + 1, d]` int64 sensors that cover each cell, padded with S, and the float64 probabilities that they miss.
-
-    Three cells covered by sensors 0, by 0 and 1, and by none of two give, with the exit, 0 2, 0 1, 2 2, 2 2.
-    """
-    sensors, chance = padded_rows(task.sees_by_cell, task.total_sensors, more=1)
-    return torch.as_tensor(sensors), torch.as_tensor(1.0 - chance)

@@ -25,20 +25,10 @@ if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its 
 def evaluate(
     problem: Problem,
     policy: PolicyLike | Array | BoolArray,
-    *,
-    guess: Array | None = ...,
-    false_alarm: float = ...,
-    per_cell: bool = ...,
+    **options: Any,
 ) -> Evaluation: ...
 @overload
-def evaluate(
-    problem: Group,
-    policy: PolicyLike,
-    *,
-    merge: str | None = ...,
-    width: float = ...,
-    seed: int = ...,
-) -> GroupEvaluation: ...
+def evaluate(problem: Group, policy: PolicyLike, **options: Any) -> GroupEvaluation: ...
 
 
 def evaluate(

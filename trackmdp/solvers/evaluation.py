@@ -120,15 +120,8 @@ def by_start(starts: IndexArray, totals: Array, num_cells: int, error: float = 0
     with np.errstate(invalid="ignore"):
         # 0 / 0 is nan on purpose: 0 would read as a worth.
         cells = [np.bincount(starts, column, num_cells) / count for column in totals.T[:5]]
-    value, steps, detections, sensors, safe = cells
-    return replace(
-        together,
-        value=value,
-        steps=steps,
-        detections=detections,
-        sensors=sensors,
-        safe_actions=safe,
-    )
+    by_cell: dict[str, Any] = dict(zip(_PER_START, cells, strict=False))
+    return replace(together, **by_cell)
 
 
 @dataclass(frozen=True)

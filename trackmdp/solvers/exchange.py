@@ -38,6 +38,7 @@ from trackmdp.solvers.search import (
     clocked_sets,
     columns_of,
     follow_credit,
+    led,
     mixed,
     risen,
     rows_changed,
@@ -77,9 +78,7 @@ FLIPPED = _flips()
 def solve(world: World, starts: int = OTHERS) -> PolicyTable:
     """The policy of `search`, improved by exchange, and from t_max 2 on by the results of `starts` other searches."""
     renewal = Renewal(world, world.motion)
-    first = Found(renewal, clocked_sets(renewal))
-    after = follow_credit(first)
-    policy = exchanged(after if after.aihtr >= first.aihtr else first)
+    policy = exchanged(led(renewal))
     if world.num_choices > 2 and renewal.size is not None:
         policy = best_of(policy, other_starts(renewal, starts))
     return policy.table
@@ -100,8 +99,8 @@ def other_starts(
     for _ in range(count if world.num_cells <= MOST_STARTED else 0):
         off = np.exp(PRICES_OFF * rng.standard_normal(world.total_sensors))
         other = replace(world, cost=world.cost * off)
-        led = renewal.priced_as(other)
-        first = Found(led, clocked_sets(led))
+        changed = renewal.priced_as(other)
+        first = Found(changed, clocked_sets(changed))
         yield follow_credit(first, steps, sweeps).sets
 
 

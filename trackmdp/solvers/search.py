@@ -194,15 +194,11 @@ def _episodes(policy: Found, plans: Plans) -> Array | float:
     return np.where(mass > 1e-12, visits / np.maximum(mass, 1e-12), 0.0)
 
 
-def solve(world: World, *, steps: int = 30, sweeps: int = 3) -> PolicyTable:
-    """The policy found by the homotopy in `steps` steps of `sweeps` sweeps each, then by plain ascent.
-
-    The better one of it and the clocked policy, so that it is never worse than that.
-    """
-    renewal = Renewal(world, world.motion)
+def led(renewal: Renewal, *, steps: int = 30) -> Found:
+    """The better one of the clocked policy and the one that the homotopy from it finds in so many `steps`."""
     first = Found(renewal, clocked_sets(renewal))
-    after = follow_credit(first, steps, sweeps)
-    return (after if after.aihtr >= first.aihtr else first).table
+    after = follow_credit(first, steps)
+    return after if after.aihtr >= first.aihtr else first
 
 
 def credit_of(world: World) -> list[Array]:

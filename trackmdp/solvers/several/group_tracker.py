@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from trackmdp.arrays.numbers import whole_number
-from trackmdp.arrays.types import BoolArray, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.solvers.several.merging import Beliefs, Rule, followed
 
@@ -96,7 +95,8 @@ class GroupTracker:
             ]
         )
         on, moved = np.array(self.sensors(), dtype=np.int64), self._beliefs.moved(self._group)
-        if not self.safe and (seen & ~self._seen_by(on)[place]).any():
+        covered = self._policy.task.sees_by_cell[:, on].sum(axis=1) > 0
+        if not self.safe and (seen & ~covered[place]).any():
             raise UserError(
                 f"report({cells}): a cell is seen by none of the {len(on)} sensors that are on, expected "
                 "one that is, or None"
@@ -107,11 +107,6 @@ class GroupTracker:
         if len(lost) and self._group.recorded is None:  # a track may make moves that no other made
             raise UserError(f"report: target {lost[0]} is missed where it would have been detected")
         self._clocks, self._beliefs = clocks, beliefs
-
-    def _seen_by(self, on: IndexArray) -> BoolArray:
-        """`[M]`, cells that some of the sensors see."""
-        seen: BoolArray = self._policy.task.sees_by_cell[:, on].sum(axis=1) > 0
-        return seen
 
 
 def _each(given: Any, call: str, count: int | None = None) -> list[Any]:

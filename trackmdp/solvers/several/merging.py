@@ -104,10 +104,6 @@ class Beliefs:
         row, state = np.divmod(found, kernel.shape[0])
         return Beliefs(row, state, mass)
 
-    def inside(self, rows: int) -> Array:
-        """`[rows]`, mass of each row."""
-        return per_row(self.row, self.mass, rows)
-
     def given(self, kept: BoolArray, seen: Array, rows: int) -> Beliefs:
         """The rows `kept` `[rows]` of a step's `moved` beliefs, their targets in the grid and missed.
 
@@ -256,7 +252,8 @@ class Merged(Rule):
         gain = moved.mass[free] * self.credit(located, misses, state) * self.task.detects(cell)
         codes, place = np.unique(episode * self.cells + cell, return_inverse=True)
         gained = per_row(place, gain, len(codes))
-        gone = 1.0 - moved.inside(episodes * targets).reshape(episodes, targets)
+        inside = per_row(moved.row, moved.mass, episodes * targets)
+        gone = 1.0 - inside.reshape(episodes, targets)
         price = (
             self.task.prices[codes % self.cells] * (1.0 - gone.prod(axis=1))[codes // self.cells]
         )
