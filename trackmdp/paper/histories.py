@@ -16,7 +16,7 @@ import numpy as np
 
 from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.policies.belief import BeliefFilter
-from trackmdp.solvers.pomdp import FiniteMdp
+from trackmdp.solvers.pomdp import solve_states
 from trackmdp.world.model import World
 
 State: TypeAlias = tuple[int, tuple[int, ...]]
@@ -56,36 +56,31 @@ def solve_histories(world: World) -> HistoryQ:
     """Policy iteration over all histories that can happen, with 2^M actions in each."""
     m, kernel = world.num_cells, world.kernel.toarray()
     actions = np.array(list(itertools.product([False, True], repeat=m)))
-    states: list[State] = [(x, ()) for x in range(m)]
-    index = {state: place for place, state in enumerate(states)}
-    problem, rows = FiniteMdp(), dict[State, int]()
+    starts: list[State] = [(x, ()) for x in range(m)]
     now, inside = dict[State, Array](), dict[State, float]()
-    for place, (x, history) in enumerate(states):  # grows while it is gone through
-        now[x, history] = _position(kernel, x, [actions[number] for number in history])
-        reach = now[x, history] @ kernel
-        inside[x, history] = float(reach.sum())
+
+    def choices(state: State) -> Iterator[tuple[float, dict[State, float]]]:
+        x, history = state
+        now[state] = _position(kernel, x, [actions[number] for number in history])
+        reach = now[state] @ kernel
+        inside[state] = float(reach.sum())
         # n = t_max + 1: the safe action locates the target, at price D, if it is still in the grid.
         if len(history) == world.num_choices:
             earned = (world.reward - world.safe_cost) * reach.sum()
-            problem.add(place, earned, list(range(m)), reach.tolist())
-            continue
-        rows[x, history] = len(problem.state)
+            yield earned, dict(zip(starts, reach.tolist(), strict=True))
+            return
         for number, action in enumerate(actions):
             found, missed = reach * action, float(reach[~action].sum())
-            targets, probability = list(range(m)), found.tolist()
+            after = dict(zip(starts, found.tolist(), strict=True))
             if missed > 0:
-                after = (x, (*history, number))
-                if after not in index:
-                    index[after] = len(states)
-                    states.append(after)
-                targets, probability = [*targets, index[after]], [*probability, missed]
+                after[x, (*history, number)] = missed
             # eq. reward_func: nothing is paid on the exit step, hence times the probability of staying.
             price = float(world.cost[action].sum()) * reach.sum()
-            problem.add(place, world.reward * found.sum() - price, targets, probability)
-    value, worth = problem.solve(len(states))
-    q = {state: worth[row : row + len(actions)] for state, row in rows.items()}
-    found_value = dict(zip(states, value.tolist(), strict=True))
-    return HistoryQ(world, actions, found_value, q, now, inside)
+            yield world.reward * found.sum() - price, after
+
+    value, worth = solve_states(starts, choices)
+    q = {state: each for state, each in worth.items() if len(state[1]) < world.num_choices}
+    return HistoryQ(world, actions, value, q, now, inside)
 
 
 def _position(kernel: Array, x: int, sets: list[BoolArray]) -> Array:

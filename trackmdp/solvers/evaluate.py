@@ -61,7 +61,8 @@ def evaluate(
         UserError: the policy draws at random with unknown probabilities, or is for another grid.
     """
     if isinstance(problem, Group):
-        return _of_group(problem, policy, **of_group)
+        rule = group_rule(problem, policy, of_group.pop("merge", None))
+        return evaluate_group(rule, **of_group)
     check_problem(problem, "evaluate")
     if of_group:
         raise UserError(f"{min(of_group)}: an option of several targets, expected none with one")
@@ -70,13 +71,6 @@ def evaluate(
         value.check_revealed(problem.motion, table)
         return believed(problem, table, false_alarm)
     return value.value_of(problem, table, guess=guess, per_cell=per_cell)
-
-
-def _of_group(
-    group: Group, policy: Any, *, merge: str | None = None, width: float = 0.005, seed: int = 0
-) -> GroupEvaluation:
-    """See `evaluate`."""
-    return evaluate_group(group_rule(group, policy, merge), width=width, seed=seed)
 
 
 def group_rule(group: Group, policy: Any, merge: str | None = None) -> Rule:

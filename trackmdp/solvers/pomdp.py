@@ -7,7 +7,9 @@ iteration. Beliefs multiply with the actions tried, so this is for worlds of a f
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from scipy import sparse
@@ -19,6 +21,10 @@ from trackmdp.world.model import World
 
 DIGITS = 12
 """Beliefs that agree to this many digits are one."""
+
+State = TypeVar("State", bound=Hashable)
+_Key: TypeAlias = tuple[int, bytes]
+"""n, and the bytes of a belief."""
 
 
 @dataclass(frozen=True)
@@ -34,45 +40,45 @@ class BeliefSolution:
     beliefs: int
 
 
-@dataclass
-class FiniteMdp:
-    """One row per state and admissible action, the rows of a state together; `state[i]` is the state of row i."""
+def solve_states(
+    starts: Sequence[State], choices: Callable[[State], Iterable[tuple[float, dict[State, float]]]]
+) -> tuple[dict[State, float], dict[State, Array]]:
+    """Policy iteration over all states that can be reached: the optimal value of each, and the worth of its choices.
 
-    state: list[int] = field(default_factory=list)
-    reward: list[float] = field(default_factory=list)
-    successors: list[tuple[list[int], list[float]]] = field(default_factory=list)
-
-    def add(
-        self, state: int, reward: float, successors: list[int], probability: list[float]
-    ) -> None:
-        """Append an action of `state`, which has to be the last state or the one after it."""
-        self.state.append(state)
-        self.reward.append(reward)
-        self.successors.append((successors, probability))
-
-    def solve(self, states: int) -> tuple[Array, Array]:
-        """Policy iteration: the optimal value `[states]`, and the worth of each row."""
-        columns = [column for successors, _ in self.successors for column in successors]
-        data = [p for _, probability in self.successors for p in probability]
-        pointer = np.concatenate(
-            [[0], np.cumsum([len(successors) for successors, _ in self.successors])]
-        )
-        moves = sparse.csr_array((data, columns, pointer), shape=(len(self.state), states))
-        reward, state = np.array(self.reward), np.array(self.state)
-        # Rows of states 0 0 0 1 1 2 give first = (0, 3, 5), the segments that reduceat takes the maximum over.
-        first = np.flatnonzero(np.diff(state, prepend=-1))
-        choice, value = first, accumulate(moves[first], reward[first])
-        while True:
-            worth = reward + moves @ value
-            best = np.maximum.reduceat(worth, first)
-            better = best > worth[choice] + 1e-12 * (1.0 + np.abs(value).max())
-            if not better.any():
-                return value, worth
-            attained = np.flatnonzero(
-                worth >= best[state]
-            )  # of each state the first row that does counts
-            choice = np.where(better, attained[np.searchsorted(attained, first)], choice)
-            value = accumulate(moves[choice], reward[choice])
+    Args:
+        starts: where to begin.
+        choices: from a state to the expected reward of each of its choices, and the probabilities of the next states.
+    """
+    states, index = list(starts), {state: place for place, state in enumerate(starts)}
+    rewards, columns, data = list[float](), list[int](), list[float]()
+    pointer, begins = [0], list[int]()
+    for state in states:  # grows while it is gone through
+        begins.append(len(rewards))
+        for earned, after in choices(state):
+            for each in after:
+                if each not in index:
+                    index[each] = len(states)
+                    states.append(each)
+            rewards.append(earned)
+            columns += [index[each] for each in after]
+            data += after.values()
+            pointer.append(len(data))
+    moves = sparse.csr_array((data, columns, pointer), shape=(len(rewards), len(states)))
+    # States with 3, 2 and 1 choices have first = (0, 3, 5), the segments that reduceat takes the maximum over.
+    reward, first = np.array(rewards), np.array(begins)
+    owner = np.repeat(np.arange(len(states)), np.diff(first, append=len(reward)))
+    choice, value = first, accumulate(moves[first], reward[first])
+    while True:
+        worth = reward + moves @ value
+        best = np.maximum.reduceat(worth, first)
+        better = best > worth[choice] + 1e-12 * (1.0 + np.abs(value).max())
+        if not better.any():
+            break
+        attained = np.flatnonzero(worth >= best[owner])  # of each state the first one counts
+        choice = np.where(better, attained[np.searchsorted(attained, first)], choice)
+        value = accumulate(moves[choice], reward[choice])
+    worths = np.split(worth, first[1:])
+    return dict(zip(states, value.tolist(), strict=True)), dict(zip(states, worths, strict=True))
 
 
 def solve(world: World, *, most_beliefs: int = 50_000) -> BeliefSolution:
@@ -81,44 +87,38 @@ def solve(world: World, *, most_beliefs: int = 50_000) -> BeliefSolution:
     Raises:
         UserError: there are more than `most_beliefs` of them.
     """
-    problem, count = _enumerate(world, most_beliefs)
-    return BeliefSolution(problem.solve(count)[0][: world.num_cells], count)
-
-
-def _enumerate(world: World, most_beliefs: int) -> tuple[FiniteMdp, int]:
     kernel = world.kernel.toarray()  # a few cells: every set of sensors is tried in every belief
     forced, price = _safe_action(world, kernel)
-    beliefs = [(belief, 0) for belief in np.eye(world.num_cells)]
-    index = {_key(belief, n): i for i, (belief, n) in enumerate(beliefs)}
-    problem = FiniteMdp()
-    for i, (belief, n) in enumerate(beliefs):  # grows while it is gone through
-        predicted = belief @ kernel
-        # After t_max + 1 misses the safe action is forced: one action, and every position is located.
-        if n == world.num_choices:
-            located = belief @ forced
-            problem.add(
-                i, world.reward * float(located.sum()) - float(belief @ price), *_sparse(located)
-            )
-            continue
-        for action in _subsets(predicted > 0):
-            found = np.where(action, predicted * world.detection, 0.0)
-            left = predicted - found
-            missed = float(left.sum())  # probability of no detection and no exit
-            targets, probability = _sparse(found)
-            if missed > 0:
-                after = left / missed  # eq. belief_up
-                key = _key(after, n + 1)
-                if key not in index:
-                    index[key] = len(beliefs)
-                    beliefs.append((after, n + 1))
-                targets, probability = [*targets, index[key]], [*probability, missed]
-            paid = float(world.cost[action].sum() * predicted.sum())
-            problem.add(i, world.reward * float(found.sum()) - paid, targets, probability)
+    beliefs = {_key(belief, 0): belief for belief in np.eye(world.num_cells)}
+    starts = list(beliefs)
+
+    def choices(state: _Key) -> Iterator[tuple[float, dict[_Key, float]]]:
         if len(beliefs) > most_beliefs:
             raise UserError(
                 f"grid.size={world.rows}: more than {most_beliefs} belief states, expected a smaller world"
             )
-    return problem, len(beliefs)
+        n, belief = state[0], beliefs[state]
+        # After t_max + 1 misses the safe action is forced: one action, and every position is located.
+        if n == world.num_choices:
+            located = belief @ forced
+            earned = world.reward * float(located.sum()) - float(belief @ price)
+            yield earned, {starts[j]: float(located[j]) for j in np.flatnonzero(located)}
+            return
+        predicted = belief @ kernel
+        for action in _subsets(predicted > 0):
+            found = np.where(action, predicted * world.detection, 0.0)
+            after = {starts[j]: float(found[j]) for j in np.flatnonzero(found)}
+            left = predicted - found
+            missed = float(left.sum())  # probability of no detection and no exit
+            if missed > 0:
+                key = _key(left / missed, n + 1)
+                beliefs.setdefault(key, left / missed)  # eq. belief_up
+                after[key] = missed
+            paid = float(world.cost[action].sum() * predicted.sum())
+            yield world.reward * float(found.sum()) - paid, after
+
+    value, _ = solve_states(starts, choices)
+    return BeliefSolution(np.array([value[start] for start in starts]), len(value))
 
 
 def _subsets(possible: BoolArray) -> BoolArray:
@@ -139,11 +139,6 @@ def _safe_action(world: World, kernel: Array) -> tuple[Array, Array]:
     return repeated @ (kernel * world.safe_detection), price
 
 
-def _sparse(vector: Array) -> tuple[list[int], list[float]]:
-    cells = np.flatnonzero(vector)
-    return cells.tolist(), vector[cells].tolist()
-
-
-def _key(belief: Array, n: int) -> tuple[int, bytes]:
+def _key(belief: Array, n: int) -> _Key:
     # + 0.0 turns -0.0 into 0.0: their bytes differ.
     return n, (belief.round(DIGITS) + 0.0).tobytes()

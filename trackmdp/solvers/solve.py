@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from inspect import signature
 from typing import TYPE_CHECKING, Any, overload
 
@@ -183,20 +183,15 @@ def by_blocks(
     sweeps = (
         (_SWEEPS if partition.halo is None else 0) if partition.sweeps is None else partition.sweeps
     )
-    table = plan_by_blocks(world, _Planner(choice), partition.block, partition.halo, run)
+    table = plan_by_blocks(world, partial(_planned, choice), partition.block, partition.halo, run)
     return (
         settled(world, table, partition.block, sweeps, run) if choice.name == "optimal" else table
     )
 
 
-@dataclass(frozen=True)
-class _Planner:
-    """The policy that a solver of the config finds for a block; picklable, to be sent to workers."""
-
-    choice: BaselineConfig
-
-    def __call__(self, number: int, world: World) -> PolicyTable:  # noqa: ARG002
-        return run_solver(world, self.choice).table
+def _planned(choice: BaselineConfig, number: int, world: World) -> PolicyTable:  # noqa: ARG001
+    """The policy that a solver of the config finds for a block."""
+    return run_solver(world, choice).table
 
 
 def baseline_policy(problem: Problem, choice: BaselineConfig) -> Policy:
