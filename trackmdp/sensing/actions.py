@@ -68,7 +68,7 @@ class ActionMask:
     ) -> None:
         footprints = task.coverage is not None and task.window is not None
         self.observed = footprints or not task.available.all()
-        self._window = Window(task, None, device) if everywhere else Window.of(task, device)
+        self._window = Window(task, None if everywhere else task.numbered, device)
         mask = np.append(task.available, False)
         if footprints:
             cells, sensors = np.indices((task.num_cells, task.total_sensors)).reshape(2, -1)

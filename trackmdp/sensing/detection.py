@@ -32,7 +32,7 @@ class Detection:
         self, task: Task, device: torch.device | str = "cpu", *, everywhere: bool = False
     ) -> None:
         self.perfect = task.perfect
-        self._window = Window(task, None, device) if everywhere else Window.of(task, device)
+        self._window = Window(task, None if everywhere else task.numbered, device)
         self._covering: Tensor | None = None
         if task.coverage is not None:
             # [M + 1, d] sensors that cover each cell, padded with S, and the probabilities that they miss: three cells

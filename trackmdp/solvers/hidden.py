@@ -87,7 +87,7 @@ def solve(
     except KeyboardInterrupt:
         interrupted = True
     seconds = time.monotonic() - began
-    found = bracketed(world, search.table, seconds, best.bound, tolerance)
+    found = bracketed(world, search.best.table, seconds, best.bound, tolerance)
     late = budget.timed_out and not found.certified
     return replace(found, nodes=best.nodes, interrupted=interrupted, timed_out=late)
 
@@ -115,7 +115,7 @@ def best_found(world: World, *, annealed: int = 0, effort: float = 1.0) -> Polic
     """The policy of `solve`, without its bound; see `Search.run`."""
     search = Search(world)
     search.run(annealed=annealed, effort=effort)
-    return search.table
+    return search.best.table
 
 
 class Search:
@@ -135,11 +135,6 @@ class Search:
         self._watch, self._done, self._most = watch, 0, 1
         # Sets after exchange, by those before: many searches begin from the same ones.
         self._ends: dict[bytes, list[AnyArray]] = {}
-
-    @property
-    def table(self) -> PolicyTable:
-        """The best policy so far."""
-        return self.best.table
 
     def run(
         self, *, start: PolicyTable | None = None, annealed: int = 0, effort: float = 1.0

@@ -43,11 +43,9 @@ class BeliefSolution:
 def solve_states(
     starts: Sequence[State], choices: Callable[[State], Iterable[tuple[float, dict[State, float]]]]
 ) -> tuple[dict[State, float], dict[State, Array]]:
-    """Policy iteration over all states that can be reached: the optimal value of each, and the worth of its choices.
+    """Policy iteration over all states reached from `starts`: the optimal value of each, and the worth of its choices.
 
-    Args:
-        starts: where to begin.
-        choices: from a state to the expected reward of each of its choices, and the probabilities of the next states.
+    Of a state, `choices` gives the expected reward of each choice and the probabilities of the next states.
     """
     states, index = list(starts), {state: place for place, state in enumerate(starts)}
     rewards, columns, data = list[float](), list[int](), list[float]()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -42,21 +43,9 @@ class Prediction:
     inside: Array
 
 
-@dataclass(frozen=True)
-class Offer:
-    """Gains and costs of sensing in one step, for all located cells.
-
-    Attributes:
-        gain: `[E]`, of a report.
-        price: `[S]`, of each sensor.
-        charge: `[M]`, factor of the prices for each located cell.
-        ties: whether a sensor that gains its very price is on.
-    """
-
-    gain: Array
-    price: Array
-    charge: Array
-    ties: bool = False
+Offer: TypeAlias = tuple[Array, Array, Array]
+"""Of sensing in one step, for all located cells: `[E]` gain of a report, `[S]` price of each sensor, and `[M]` factor
+of the prices for each located cell."""
 
 
 def qmdp(world: World, *, in_grid: bool = False) -> PolicyTable:
@@ -95,8 +84,8 @@ def myopic(world: World, *, threshold: float | None = None) -> PolicyTable:
     if threshold is None:
         return qmdp(world, in_grid=True)
     # The threshold is as a price, the same of all sensors.
-    limit = np.where(world.available, threshold, world.prices)
-    return unroll(world, lambda seen: Offer(seen.mass, limit, seen.before, ties=True))
+    limit = np.where(world.available, threshold, world.prices) * (1.0 - TIE)
+    return unroll(world, lambda seen: (seen.mass, limit, seen.before))
 
 
 def clocked_policy(world: World) -> PolicyTable:
@@ -116,7 +105,7 @@ def clocked_rule(world: World) -> Callable[[Prediction], Offer]:
 
     def gains(seen: Prediction) -> Offer:
         credit = world.reward + table[seen.cells, 0] - table[seen.cells, seen.n + 1]
-        return Offer(seen.mass * credit, world.prices, seen.inside)
+        return seen.mass * credit, world.prices, seen.inside
 
     return gains
 
@@ -136,12 +125,11 @@ def unroll(
         inside = per_row(step.rows, now, world.num_cells)
         # Joint with the misses, not conditioned on them.
         seen = Prediction(n, step.rows, step.states, now, before, inside)
-        offer = rule(seen)
+        gain, prices, charge = rule(seen)
         located = None if world.window is None else np.arange(world.num_cells)
         choice = sensing(world, seen.rows, seen.cells, world.num_cells, located, distinct=True)
-        slack = 1.0 - TIE if offer.ties else 1.0
-        price = offer.price[choice.sensors] * offer.charge[choice.rows] * slack
-        on = choice.best(offer.gain[:, None], price[:, None])
+        price = prices[choice.sensors] * charge[choice.rows]
+        on = choice.best(gain[:, None], price[:, None])
         sensed.append((choice.rows[on[:, 0]], choice.sensors[on[:, 0]]))
         mass = now
         if learns:
@@ -152,5 +140,5 @@ def unroll(
 
 
 def _offer(world: World, seen: Prediction, charged: Array) -> Offer:
-    """The reward of a report at once, and the price of a sensor where it is `charged`."""
-    return Offer(seen.mass * world.reward, world.prices, charged, ties=True)
+    """The reward of a report at once, and the price of a sensor where it is `charged`; to gain it is enough."""
+    return seen.mass * world.reward, world.prices * (1.0 - TIE), charged
