@@ -25,10 +25,20 @@ if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its 
 def evaluate(
     problem: Problem,
     policy: PolicyLike | Array | BoolArray,
-    **options: Any,
+    *,
+    guess: Array | None = ...,
+    false_alarm: float = ...,
+    per_cell: bool = ...,
 ) -> Evaluation: ...
 @overload
-def evaluate(problem: Group, policy: PolicyLike, **options: Any) -> GroupEvaluation: ...
+def evaluate(
+    problem: Group,
+    policy: PolicyLike,
+    *,
+    merge: str | None = ...,
+    width: float = ...,
+    seed: int = ...,
+) -> GroupEvaluation: ...
 
 
 def evaluate(
@@ -61,8 +71,7 @@ def evaluate(
         UserError: the policy draws at random with unknown probabilities, or is for another grid.
     """
     if isinstance(problem, Group):
-        rule = group_rule(problem, policy, of_group.pop("merge", None))
-        return evaluate_group(rule, **of_group)
+        return _of_group(problem, policy, **of_group)
     check_problem(problem, "evaluate")
     if of_group:
         raise UserError(f"{min(of_group)}: an option of several targets, expected none with one")
@@ -71,6 +80,13 @@ def evaluate(
         value.check_revealed(problem.motion, table)
         return believed(problem, table, false_alarm)
     return value.value_of(problem, table, guess=guess, per_cell=per_cell)
+
+
+def _of_group(
+    group: Group, policy: Any, *, merge: str | None = None, width: float = 0.005, seed: int = 0
+) -> GroupEvaluation:
+    """See `evaluate`."""
+    return evaluate_group(group_rule(group, policy, merge), width=width, seed=seed)
 
 
 def group_rule(group: Group, policy: Any, merge: str | None = None) -> Rule:
