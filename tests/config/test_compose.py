@@ -58,6 +58,8 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"grid.size": 2}, "grid.size=2: expected an integer >= 3"),
     ({"algo": "ppo", "algo.minibatches": 3}, "algo.minibatches=3: expected a divisor"),
     ({"kernel": "table"}, "kernel.path: missing, expected a path"),
+    ({"kernel": "given"}, "kernel.reveals: missing, expected a problem made in Python"),
+    ({"sensor": "given"}, "sensor.wide: missing, expected a problem made in Python"),
     ({"credit": "per_sensor"}, "credit: renamed, expected algo=a2c_per_sensor"),
     (
         {"algo": "hindsight", "algo.explore.until": 0.3},

@@ -9,6 +9,8 @@ from trackmdp.config.options import choice, count_option, option
 from trackmdp.config.sensors import SensorConfig
 from trackmdp.config.world import GridConfig
 
+_SET = "a problem made in Python, for which trackmdp.train sets it"
+
 
 @choice("kernel", "given", makes="trackmdp.world.problem_file:refuse_given")
 class GivenKernelConfig(HiddenKernelConfig):
@@ -16,10 +18,8 @@ class GivenKernelConfig(HiddenKernelConfig):
 
     motion: bool = option("whether there is a motion model; false: recorded tracks")
     modes: int = count_option("hidden modes of the target", unit="modes")
-    digest: str = option(
-        "of the problem, so that runs of two problems stay apart",
-        expects="no command line but trackmdp.train to set it",
-    )
+    digest: str = option("of the problem, so that runs of two problems stay apart", expects=_SET)
+    reveals: bool = option("whether a detection reveals the mode as well", expects=_SET)
 
     @property
     def is_motion(self) -> bool:  # type: ignore[override]  # a class attribute of the other kernels
@@ -41,7 +41,7 @@ class GivenKernelConfig(HiddenKernelConfig):
 class GivenSensorConfig(SensorConfig):
     """Footprints and probabilities of detection of the problem given to `trackmdp.train`."""
 
-    wide: bool = option("whether a sensor covers a set of cells")
+    wide: bool = option("whether a sensor covers a set of cells", expects=_SET)
 
     @property
     def covers(self) -> bool:  # type: ignore[override]  # a class attribute of the other sensors
