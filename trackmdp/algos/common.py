@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from inspect import signature
@@ -82,30 +83,37 @@ def make_algorithm(
 class Checkpointed:
     """An object saved in a checkpoint by the names of its parts.
 
-    Modules, optimizers and the like by their `state_dict`, generators by their state, plain values as they are.
+    Modules, optimizers and the like by their `state_dict`, generators by their state, arrays as tensors, plain values
+    as they are.
     """
 
     parts: ClassVar[tuple[str, ...]]
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to resume exactly."""
-        return {name: _state(getattr(self, name)) for name in self.parts}
+        return {name.strip("_"): _state(getattr(self, name)) for name in self.parts}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
         for name in self.parts:
-            part = getattr(self, name)
+            part, saved = getattr(self, name), state[name.strip("_")]
             if isinstance(part, torch.Generator):
-                part.set_state(state[name].cpu())
+                part.set_state(saved.cpu())
+            elif isinstance(part, np.random.Generator):
+                part.bit_generator.state = json.loads(saved)
             elif hasattr(part, "load_state_dict"):
-                part.load_state_dict(state[name])
+                part.load_state_dict(saved)
             else:
-                setattr(self, name, state[name])
+                setattr(self, name, saved.cpu().numpy() if isinstance(part, np.ndarray) else saved)
 
 
 def _state(part: Any) -> Any:
     if isinstance(part, torch.Generator):
         return part.get_state()
+    if isinstance(part, np.random.Generator):
+        return json.dumps(part.bit_generator.state)  # 128 bits, too many for an integer
+    if isinstance(part, np.ndarray):
+        return torch.as_tensor(part)
     return part.state_dict() if hasattr(part, "state_dict") else part
 
 

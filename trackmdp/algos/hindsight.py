@@ -74,13 +74,15 @@ def budget(task: Task, cfg: PerSensorConfig) -> tuple[int, int]:
     return updates, hidden if cfg.hidden is None else cfg.hidden
 
 
-class Hindsight:
+class Hindsight(Checkpointed):
     """Collects with all sensors on, then learns from those frames alone; with `collect=mixed` both at once.
 
     The nets see the target's neighbourhood as far as the frames have shown it to move, so they are made after those, or
     after the frames that come before the mixture. A target that goes farther later counts as gone, for the nets have no
     output for where it is.
     """
+
+    parts: ClassVar[tuple[str, ...]] = ("_seed", "_iteration", "_update", "_buffer", "_generator")
 
     def __init__(
         self, task: Task, cfg: PerSensorConfig, *, iterations: int, seed: int, device: torch.device
@@ -155,28 +157,18 @@ class Hindsight:
     def state_dict(self) -> dict[str, Any]:
         """Counters, generator, moves, and once they exist the nets with all that trains them."""
         learner = self._learner
-        return {
-            "seed": self._seed,
-            "iteration": self._iteration,
-            "update": self._update,
-            "generator": self._generator.get_state(),
-            "buffer": self._buffer.state_dict(),
-            "learner": None if learner is None else learner.state_dict(),
-        }
+        return super().state_dict() | {"learner": None if learner is None else learner.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
-        self._seed = state["seed"]
-        self._iteration, self._update = state["iteration"], state["update"]
-        self._buffer.load_state_dict(state["buffer"])
-        self._seen = None
-        self._learner = None
-        if state["learner"] is not None:
-            self._learner = self._make_learner(state["learner"]["reach"])
-            self._learner.load_state_dict(state["learner"])
+        self._seen = self._learner = None
+        if saved := state["learner"]:
+            self._learner = self._make_learner(saved["reach"])
+            self._learner.load_state_dict(saved)
+        # After the learner, whose initial weights were drawn from the generator.
+        super().load_state_dict(state)
+        if self._learner is not None:
             self._renew_policy(self._learner)
-        # Last: making the learner above drew its initial weights from it.
-        self._generator.set_state(state["generator"].cpu())
 
     def _renew_policy(self, learner: _Learner) -> None:
         """Rebuild the evaluated policy, and with `collect=mixed` the collecting one, from the averaged actor."""

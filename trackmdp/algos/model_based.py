@@ -9,16 +9,15 @@ Thompson 1933), which costs far less and leaves moves to be inferred from misses
 
 from __future__ import annotations
 
-import json
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from scipy import sparse
 from tensordict import TensorDictBase
 
-from trackmdp.algos.common import arrays, known_alone, lifted, located, tensors
+from trackmdp.algos.common import Checkpointed, arrays, known_alone, lifted, located, tensors
 from trackmdp.algos.estimates.alike import cell_classes
 from trackmdp.algos.estimates.hidden_modes import Fit, fit_modes
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
@@ -56,7 +55,7 @@ its plan the policies that are annealed at least, and the effort. With six modes
 step lower."""
 
 
-class ModelBased:
+class ModelBased(Checkpointed):
     """Plans some times in a run, the last time at its end, from all that was sensed so far.
 
     Args:
@@ -66,6 +65,17 @@ class ModelBased:
         seed: seed of the run.
         device: where the policies' tables live; the estimates are on the CPU.
     """
+
+    parts: ClassVar = (
+        "_iteration",
+        "_frames",
+        "_sensors",
+        "_found",
+        "_rng",
+        "_estimate",
+        "_paths",
+        "policy",
+    )
 
     def __init__(
         self, task: Task, cfg: ModelBasedConfig, *, iterations: int, seed: int, device: torch.device
@@ -80,11 +90,11 @@ class ModelBased:
         self._estimate = self._new_estimate()
         self._least = least_worth_planning(task)
         self._rng = np.random.default_rng(derive(seed, "model_based"))
-        self._iteration, self._spent = 0, np.zeros(2)
+        self._iteration, self._frames, self._sensors = 0, 0, 0.0
         beliefs = ("believed_aihtr", "believed_deviation")
         on_paths = ("keys_seen", "reward_per_move")
         self._found = dict.fromkeys(beliefs if by == "moves" else on_paths, math.nan)
-        self._before: PolicyTable | None = None
+        self._plan: PolicyTable | None = None
         self._fit: Fit | None = None
         # Under a budget the safe action alone locates the target at first, and moves are inferred from where it was.
         self.actor = Policy.none(task) if limited else Policy.all_on(task)
@@ -106,7 +116,8 @@ class ModelBased:
         """Take in one batch `[B, time]`, plan where it is time to, and choose the sets of the next one."""
         self._iteration += 1
         if batch is not None:
-            self._spent += [batch.numel(), _sensors_on(batch)]
+            self._frames += batch.numel()
+            self._sensors += _sensors_on(batch)
             if self._paths is not None:
                 self._paths.extend(batch)
             if self._paths is None or self._chooses:
@@ -117,11 +128,14 @@ class ModelBased:
         if renews or (due and self._paths is None):
             self._estimate.fit(self.cfg.rounds * (_LAST if last else 1))
         if due:
-            plan = self._plan_moves(last) if self._paths is None else self._plan_paths(last)
-            self.actor = as_policy(self.task, plan)
-        if renews and self._spent[0] >= self._warm_up:
+            self._follow(self._plan_moves(last) if self._paths is None else self._plan_paths(last))
+        if renews and self._frames >= self._warm_up:
             self._draw()
         return self._diagnostics()
+
+    def _follow(self, plan: PolicyTable) -> None:
+        """Take a plan as the policy that is evaluated."""
+        self._plan, self.actor = plan, as_policy(self.task, lifted(self.task, plan))
 
     def _draw(self) -> None:
         """Act on the plan for a drawn kernel.
@@ -148,11 +162,10 @@ class ModelBased:
         if last or self._chooses:
             plan = exchange.solve(world, exchange.OTHERS if last else 0)
         else:
-            before = self._before if self._before is not None else PolicyTable.all_on(world)
+            before = self._plan if self._plan is not None else PolicyTable.all_on(world)
             plan = exchange.improve(world, before, once=True)
-        self._before = plan
-        self._found |= self._beliefs(plan, world)
-        return lifted(self.task, plan)
+        self._found = self._beliefs(plan, world)
+        return plan
 
     def _plan_paths(self, last: bool) -> PolicyTable:
         """The plan on the sensed paths: at the end the best one of several on validation paths."""
@@ -175,8 +188,8 @@ class ModelBased:
             paths = Paths(task, some, cfg.gamma)
             prior = UNJUDGED * paths.copies if cfg.prior is None else cfg.prior
             found = plan_paths(paths, prior=prior, rounds=cfg.rounds)
-        self._found["keys_seen"] = float(found.seen)
-        self._found["reward_per_move"] = found.reward / max(found.moves, 1)
+        reward = found.reward / max(found.moves, 1)
+        self._found = {"keys_seen": float(found.seen), "reward_per_move": reward}
         return found.policy
 
     def _pooled(self, tracks: Tracks, _: PolicyTable | None) -> PolicyTable:
@@ -212,40 +225,22 @@ class ModelBased:
 
     def _diagnostics(self) -> dict[str, float]:
         """Figures of the last plan, and the costs of learning so far."""
-        frames, sensors = self._spent
-        found = self._found | {"sensors_per_frame": sensors / max(frames, 1.0)}
+        found = self._found | {"sensors_per_frame": self._sensors / max(self._frames, 1)}
         if self._paths is not None:
             return found | {"paths": float(len(self._paths))}
         return found | {"least_visits": float(self._estimate.visits.min())}
 
     def state_dict(self) -> dict[str, Any]:
         """The observations, the draws to come and the tables."""
-        generator = json.dumps(self._rng.bit_generator.state)  # 128 bits, too many for an integer
-        before = None if self._before is None else tensors(packed(self._before))
-        return {
-            "iteration": self._iteration,
-            "spent": torch.as_tensor(self._spent),
-            "found": dict(self._found),
-            "rng": generator,
-            "estimate": tensors(self._estimate.state()),
-            "paths": None if self._paths is None else self._paths.state_dict(),
-            "policy": self.policy.state_dict(),
-            "actor": tensors(packed(self.actor)),
-            "before": before,
-        }
+        plan = None if self._plan is None else tensors(packed(self._plan))
+        return super().state_dict() | {"plan": plan}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
-        self._iteration, self._spent = state["iteration"], state["spent"].cpu().numpy().copy()
-        self._found = dict(state["found"])
-        self._rng.bit_generator.state = json.loads(state["rng"])
-        self._estimate.load_state(arrays(state["estimate"]))
-        if self._paths is not None:
-            self._paths.load_state_dict(state["paths"])
-        self.policy.load_state_dict(state["policy"])
-        self.actor = Policy.from_table(unpacked_policy(self.task, arrays(state["actor"])))
-        if state["before"] is not None:
-            self._before = unpacked_policy(self._located, arrays(state["before"]))
+        super().load_state_dict(state)
+        if state["plan"] is not None:
+            task = self._located if self._paths is None else self.task
+            self._follow(unpacked_policy(task, arrays(state["plan"])))
 
 
 def _sensors_on(batch: TensorDictBase) -> float:

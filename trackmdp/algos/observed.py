@@ -5,7 +5,8 @@ Only the tracker's observations are read: where and when it located the target, 
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -25,6 +26,7 @@ from trackmdp.recordings.tracks import Tracks, ends_of
 from trackmdp.sensing.coverage import reported
 from trackmdp.sensing.task import Task
 from trackmdp.sensing.windows import Window
+from trackmdp.world.problem_file import as_arrays, from_arrays
 
 _ENDING = 8
 """Cells at the end of a path that identify its recording: wherever a path began, it ends as its recording."""
@@ -104,6 +106,33 @@ def _waits(
     return np.where(forced, since - 1, 0)[ended], taken[:, -1] - base[:, -1]
 
 
+@dataclass(frozen=True)
+class _Sensed(ObservedPaths):
+    """Observed paths of targets that are followed.
+
+    Attributes:
+        episode: `[K]` number of the episode.
+        waits: `[K]` misses of the safe action, < 0 where unknown.
+    """
+
+    episode: IndexArray
+    waits: IndexArray
+
+    def waiting(self) -> Self:
+        """The paths with misses of no set for those of the safe action."""
+        if not self.waits.any():
+            return self
+        more = int(self.waits.max())
+        lengths = np.diff(self.sensed.indptr).reshape(-1, self.choices)
+        wide = np.pad(lengths, ((0, 0), (0, more))).ravel()
+        pointer = np.concatenate([[0], np.cumsum(wide)])
+        sensed = sparse.csr_array(
+            (self.sensed.data, self.sensed.indices, pointer),
+            shape=(len(wide), self.sensed.shape[1]),
+        )
+        return replace(self, misses=self.misses + self.waits, sensed=sensed)
+
+
 class SensedPaths:
     """Whole paths put together from batches, each row continuing the last.
 
@@ -118,10 +147,7 @@ class SensedPaths:
 
     def __init__(self, task: Task, capacity: int | None = None, seed: int = 0) -> None:
         self._task, self._capacity, self._seed = task, capacity, seed
-        self._parts: list[ObservedPaths] = []
-        self._episodes: list[IndexArray] = []
-        # Misses of the safe action on each path, < 0 where unknown.
-        self._waits: list[IndexArray] = []
+        self._parts: list[_Sensed] = []
         # [B], safe actions of each row's unfinished path.
         self._waiting: IndexArray = np.zeros(0, dtype=np.int64)
         self._running = np.zeros(0, dtype=np.int64)  # [B], number of the episode of each row
@@ -150,13 +176,11 @@ class SensedPaths:
         number = np.where(begun > 0, base[:, None] + begun - 1, self._running[:, None])
         self._running = np.where(ends > 0, base + ends - 1, self._running)
         self._next += int(ends.sum())
-        self._parts.append(paths)
-        self._episodes.append(number[row, time])
         waits, self._waiting = _waits(batch, self._task.num_choices, self._waiting)
-        self._waits.append(waits)
+        self._parts.append(_Sensed(**vars(paths), episode=number[row, time], waits=waits))
         self._tracks = None
         while self._capacity is not None and len(self) > self._capacity and len(self._parts) > 1:
-            del self._parts[0], self._episodes[0], self._waits[0]
+            del self._parts[0]
 
     def _continued(self, row: IndexArray, begun: IndexArray, start: IndexArray, rows: int) -> bool:
         """Whether every row goes on as the batch before ended; not so where workers deliver in any order."""
@@ -164,7 +188,7 @@ class SensedPaths:
             return False
         cells = self._task.num_cells
         last = np.full(self._next, cells)
-        last[self._episodes[-1]] = self._parts[-1].end
+        last[self._parts[-1].episode] = self._parts[-1].end
         first = np.flatnonzero((begun == 0) & (np.diff(row, prepend=-1) > 0))
         before = last[self._running[row[first]]]
         return bool(((before >= cells) | (before == start[first])).all())
@@ -184,16 +208,13 @@ class SensedPaths:
 
     def _joined(self) -> Tracks:
         cells = self._task.num_cells
-        episode = np.concatenate(self._episodes)
-        order = np.argsort(episode, kind="stable")
-        paths = ObservedPaths.of(self._parts, cells).pick(order)
-        waits = np.concatenate(self._waits)[order]
+        paths = _Sensed.of(self._parts, cells)
+        order = np.argsort(paths.episode, kind="stable")
         # Else nothing is known of where the target went.
-        known = (waits >= 0) & (waits <= _LONGEST_WAIT)
-        paths, episode = paths.pick(np.flatnonzero(known)), episode[order][known]
-        paths = paths.waiting(waits[known])
-        begins = np.ones(len(episode), dtype=bool)
-        begins[1:] = (np.diff(episode) != 0) | (paths.end[:-1] != paths.start[1:])
+        known = ((paths.waits >= 0) & (paths.waits <= _LONGEST_WAIT))[order]
+        paths = paths.pick(order[known]).waiting()
+        begins = np.ones(len(paths.start), dtype=bool)
+        begins[1:] = (np.diff(paths.episode) != 0) | (paths.end[:-1] != paths.start[1:])
         # A path adds its hidden cells and its end, the first one of a track its start as well.
         first = ends_of((paths.misses + 1 + begins).astype(np.int64))
         line = np.full(first[-1], -1)
@@ -227,30 +248,23 @@ class SensedPaths:
 
     def state_dict(self) -> dict[str, Any]:
         """All that was observed."""
-        paths = ObservedPaths.of(self._parts, self._task.num_cells)
-        sizes = [len(part.start) for part in self._parts]
         numbers = {
-            "sizes": np.array(sizes, dtype=np.int64),
-            "episodes": np.concatenate([np.zeros(0, dtype=np.int64), *self._episodes]),
-            "waits": np.concatenate([np.zeros(0, dtype=np.int64), *self._waits]),
+            "sizes": np.array([len(part.start) for part in self._parts], dtype=np.int64),
             "waiting": self._waiting,
             "running": self._running,
-            "next": np.array([self._next]),
+            "next": self._next,
         }
-        return tensors(numbers | paths.state())
+        paths = _Sensed.of(self._parts, self._task.num_cells)
+        return tensors(as_arrays(numbers | vars(paths)))
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
-        each = arrays(state)
-        ends = np.cumsum(each["sizes"])
-        paths = ObservedPaths.of_state(each, self._task.num_cells)
+        parts = from_arrays(arrays(state))
+        self._waiting, self._running = parts.pop("waiting"), parts.pop("running")
+        self._next, ends = parts.pop("next"), np.cumsum(parts.pop("sizes"))
+        paths = _Sensed(**parts)
         places = np.split(np.arange(len(paths.start)), ends[:-1]) if len(ends) else []
         self._parts = [paths.pick(place) for place in places]
-        self._episodes, self._waits = (
-            [each[name][place] for place in places] for name in ("episodes", "waits")
-        )
-        self._waiting = each["waiting"].copy()
-        self._running, self._next = each["running"].copy(), int(each["next"][0])
         self._tracks = None
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from trackmdp.algos.common import arrays, tensors
+from trackmdp.algos.common import Checkpointed
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.estimates.path_plans import parted
 from trackmdp.algos.moves import CellIndex, MoveBuffer, cell_dtype
@@ -19,7 +19,7 @@ from trackmdp.recordings.tracks import Tracks
 from trackmdp.sensing.task import Task
 
 
-class SegmentBuffer:
+class SegmentBuffer(Checkpointed):
     """Replay buffer of path segments: a located cell and the cells sensed in the `steps` steps after it, M for outside.
 
     Unlike `MoveBuffer` it never puts a path together from moves of different ones. A segment begins at every step that
@@ -32,6 +32,8 @@ class SegmentBuffer:
         generator: draws the paths; the index lives on its device.
         judge: seed by which recordings are kept from the segments, to judge the learned policies by; None: none.
     """
+
+    parts: ClassVar = ("judge", "_paths")
 
     def __init__(
         self,
@@ -102,14 +104,9 @@ class SegmentBuffer:
         drawn = torch.randint(segments.shape[1], (count,), generator=self._generator, device=device)
         return segments.index_select(1, drawn).long()
 
-    def state_dict(self) -> dict[str, Any]:
-        """The paths, and which of them judge; the generator is its owner's to save."""
-        return {"judge": self.judge, "paths": self._paths.state_dict()}
-
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
-        self.judge = state["judge"]
-        self._paths.load_state_dict(state["paths"])
+        super().load_state_dict(state)
         self._drawn_from = None
 
 
@@ -164,9 +161,9 @@ class InferredMoves(MoveBuffer):
 
     def state_dict(self) -> dict[str, Tensor]:
         """All that was observed; the generator is its owner's to save."""
-        return tensors(self._estimate.state())
+        return self._estimate.state_dict()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Continue from a `state_dict`."""
-        self._estimate.load_state(arrays(state))
+        self._estimate.load_state_dict(state)
         self._index = None

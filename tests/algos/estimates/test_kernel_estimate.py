@@ -200,7 +200,7 @@ def test_a_saved_estimate_goes_on_as_it_was() -> None:
     first, second = (KernelEstimate(2, weight=0.1, exit_weight=1.0) for _ in range(2))
     first.add(paths_of(simulated(200, seed=2)))
     first.fit(3)
-    second.load_state(first.state())
+    second.load_state_dict(first.state_dict())
     for estimate in (first, second):
         estimate.add(paths_of(simulated(100, seed=3)))
         estimate.fit(2)
@@ -215,7 +215,7 @@ def test_a_state_taken_before_or_after_a_fit_goes_on_with_the_same_bits(fits: in
     going.add(early)
     for _ in range(fits):
         going.fit(1)
-    resumed.load_state(going.state())
+    resumed.load_state_dict(going.state_dict())
     for estimate in (going, resumed):
         estimate.add(late)
     np.testing.assert_array_equal(resumed.mean().toarray(), going.mean().toarray())

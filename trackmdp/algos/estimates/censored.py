@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
 
 import numpy as np
 from scipy import sparse
@@ -48,54 +49,22 @@ class ObservedPaths:
         # Rows t, t + (t_max + 1), ...: the set of miss t of every path.
         return [self.sensed[t :: self.choices] for t in range(misses)]
 
-    def pick(self, paths: IndexArray) -> ObservedPaths:
+    def pick(self, paths: IndexArray) -> Self:
         """The `paths` of these numbers, in their order."""
         # With t_max = 1, path 3 has the rows 3 * 2 + (0, 1) = 6, 7.
         rows = (paths[:, None] * self.choices + np.arange(self.choices)).ravel()
-        return ObservedPaths(
-            self.start[paths], self.misses[paths], self.sensed[rows], self.end[paths]
-        )
-
-    def waiting(self, waits: IndexArray) -> ObservedPaths:
-        """The paths with so many misses more, `[K]`, which tell nothing."""
-        if not waits.any():
-            return self
-        more = int(waits.max())
-        lengths = np.diff(self.sensed.indptr).reshape(-1, self.choices)
-        wide = np.pad(lengths, ((0, 0), (0, more))).ravel()
-        pointer = np.concatenate([[0], np.cumsum(wide)])
-        sensed = sparse.csr_array(
-            (self.sensed.data, self.sensed.indices, pointer),
-            shape=(len(wide), self.sensed.shape[1]),
-        )
-        return ObservedPaths(self.start, self.misses + waits, sensed, self.end)
+        columns = {name: part[paths] for name, part in vars(self).items() if name != "sensed"}
+        return replace(self, sensed=self.sensed[rows], **columns)
 
     @classmethod
-    def of(cls, parts: Sequence[ObservedPaths], cells: int) -> ObservedPaths:
+    def of(cls, parts: Sequence[ObservedPaths], cells: int) -> Self:
         """All paths of `parts`, one after the other, on a grid of so many cells."""
-        none = np.zeros(0, dtype=np.int64)
-        each = [cls(none, none, sparse.csr_array((0, cells)), none), *parts]
-        start, misses, end = (
-            np.concatenate([getattr(part, name) for part in each])
-            for name in ("start", "misses", "end")
-        )
-        return cls(start, misses, sparse.vstack([part.sensed for part in each]), end)
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Plain arrays of all of it."""
-        parts = {"start": self.start, "misses": self.misses, "end": self.end}
-        return parts | {
-            f"sensed_{part}": getattr(self.sensed, part) for part in ("data", "indices", "indptr")
-        }
-
-    @classmethod
-    def of_state(cls, state: dict[str, np.ndarray], cells: int) -> ObservedPaths:
-        """The paths of a `state`, on a grid of so many cells."""
-        data, indices, indptr = (
-            state[f"sensed_{part}"].copy() for part in ("data", "indices", "indptr")
-        )
-        sensed = sparse.csr_array((data, indices, indptr), shape=(len(indptr) - 1, cells))
-        return cls(state["start"].copy(), state["misses"].copy(), sensed, state["end"].copy())
+        sets = [sparse.csr_array((0, cells)), *(part.sensed for part in parts)]
+        columns: dict[str, Any] = {"sensed": sparse.vstack(sets)}
+        for name in {each.name for each in fields(cls)} - {"sensed"}:
+            none = np.zeros(0, dtype=np.int64)
+            columns[name] = np.concatenate([none, *(getattr(part, name) for part in parts)])
+        return cls(**columns)
 
 
 def each_once(paths: ObservedPaths) -> tuple[ObservedPaths, Array]:

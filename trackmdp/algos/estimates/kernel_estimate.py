@@ -10,11 +10,13 @@ the moves of the prior, which puts the displacements seen anywhere down at every
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from scipy import sparse
+from torch import Tensor
 
+from trackmdp.algos.common import arrays, tensors
 from trackmdp.algos.estimates.alike import AlikeCells
 from trackmdp.algos.estimates.censored import ObservedPaths, counted, each_once, expected_moves
 from trackmdp.algos.estimates.shrinkage import posterior_mean, unseen
@@ -22,6 +24,7 @@ from trackmdp.arrays.entries import ones_at, per_row, row_index, with_data
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.grid.displacements import apart, cell_at, displacement
 from trackmdp.grid.size import grid_size
+from trackmdp.world.problem_file import as_arrays, from_arrays
 
 _SETTLED = 1e-5
 """Share of all moves that a round counts elsewhere than the one before, below which no more rounds follow."""
@@ -102,27 +105,19 @@ class KernelEstimate:
         self.direct = self.direct + counted(start, end, count, self.direct.shape)
         self.counts = self.direct if unfitted else self.counts
 
-    def state(self) -> dict[str, np.ndarray]:
-        """All that was observed, and the counts so far, as plain arrays; none before the first fit."""
-        parts = ObservedPaths.of(self._censored, self.num_cells).state()
+    def state_dict(self) -> dict[str, Tensor]:
+        """All that was observed, and the counts so far; none before the first fit."""
+        parts = {"direct": self.direct} | vars(ObservedPaths.of(self._censored, self.num_cells))
         fitted = {} if self.counts is self.direct else {"counts": self.counts}
-        for name, matrix in {"direct": self.direct, **fitted}.items():
-            parts |= {
-                f"{name}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr")
-            }
-        return parts
+        return tensors(as_arrays(parts | fitted))
 
-    def load_state(self, state: dict[str, np.ndarray]) -> None:
-        """Continue from a `state`."""
-
-        def matrix(name: str) -> sparse.csr_array:
-            parts = tuple(state[f"{name}_{part}"].copy() for part in ("data", "indices", "indptr"))
-            return sparse.csr_array(parts, shape=self.direct.shape)
-
-        self.direct = matrix("direct")
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Continue from a `state_dict`."""
+        parts = from_arrays(arrays(state))
+        self.direct = parts.pop("direct")
         # Without counts of their own, moves that are added count at once (`add_moves`).
-        self.counts = matrix("counts") if "counts_data" in state else self.direct
-        paths = ObservedPaths.of_state(state, self.num_cells)
+        self.counts = parts.pop("counts", self.direct)
+        paths = ObservedPaths(**parts)
         self._censored = [paths] if len(paths.start) else []
 
     def fit(self, rounds: int) -> None:
