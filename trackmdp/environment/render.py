@@ -48,36 +48,28 @@ def around(place: int, length: int, wide: int) -> range:
     return range(begin, min(begin + wide, length))
 
 
-def text_rows(size: Sequence[int], cell: int, on: BoolArray, *, found: bool) -> list[str]:
-    """A line of symbols for each row of the grid; see `PICTURE_LEGEND`.
+def picture(
+    mode: str, size: Sequence[int], cell: int, on: BoolArray, *, found: bool
+) -> npt.NDArray[np.uint8] | str:
+    """The grid as pixels or as text.
 
     Args:
+        mode: "rgb_array" for red, green and blue `[16 rows, 16 columns, 3]`, else a line of symbols for each row, and
+            `PICTURE_LEGEND`.
         size: rows and columns.
         cell: the target's, M where it has exited.
         on: `[M]` sensors that are on.
         found: whether the target is detected.
     """
-    return [" ".join(row) for row in symbols(size, cell, on, found=found)]
-
-
-def picture(
-    mode: str, size: Sequence[int], cell: int, on: BoolArray, *, found: bool
-) -> npt.NDArray[np.uint8] | str:
-    """The grid as `pixels` in the mode "rgb_array", else as text with its legend; arguments as for `text_rows`."""
-    if mode == "rgb_array":
-        return pixels(size, cell, on, found=found)
-    return "\n".join([*text_rows(size, cell, on, found=found), PICTURE_LEGEND])
-
-
-def pixels(size: Sequence[int], cell: int, on: BoolArray, *, found: bool) -> npt.NDArray[np.uint8]:
-    """`[16 rows, 16 columns, 3]` red, green and blue; arguments as for `text_rows`."""
     marks = symbols(size, cell, on, found=found)
-    picture = np.full((*marks.shape, _SIDE, _SIDE, 3), 255, dtype=np.uint8)
+    if mode != "rgb_array":
+        return "\n".join([*(" ".join(row) for row in marks), PICTURE_LEGEND])
+    pixels = np.full((*marks.shape, _SIDE, _SIDE, 3), 255, dtype=np.uint8)
     for symbol, colour in _COLOURS.items():
         # A boolean index picks whole tiles, [hits, side, side, 3], and their inner part gets the colour.
-        tiles = picture[marks == symbol]
+        tiles = pixels[marks == symbol]
         tiles[:, _GAP:-_GAP, _GAP:-_GAP] = colour
-        picture[marks == symbol] = tiles
+        pixels[marks == symbol] = tiles
     # [rows, columns, y, x, 3] to [rows, y, columns, x, 3]: neighbouring tiles' lines of pixels side by side.
     rows, columns = marks.shape
-    return picture.transpose(0, 2, 1, 3, 4).reshape(rows * _SIDE, columns * _SIDE, 3)
+    return pixels.transpose(0, 2, 1, 3, 4).reshape(rows * _SIDE, columns * _SIDE, 3)
