@@ -20,9 +20,10 @@ from trackmdp.errors import UserError
 from trackmdp.policies import lookup, policy
 from trackmdp.policies.forms import STATE_KEYS
 from trackmdp.policies.nets import SubsetDistribution
-from trackmdp.policies.policy import Policy, actor_table, as_policy
+from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.sensing.task import Task
 from trackmdp.solvers.evaluate import evaluate
+from trackmdp.training.group_run import learned_policy
 from trackmdp.world.model import World
 
 WORLD = small_world(t_max=2)
@@ -383,7 +384,7 @@ def test_a_sparse_table_is_brought_into_order_and_left_alone() -> None:
 def test_an_actor_that_is_a_policy_is_not_written_out() -> None:
     """All sensors on at 64 x 64 cells would be 33 million entries, 1.5 GB while they are made and valued."""
     actor = Policy.all_on(WORLD)
-    assert actor_table(WORLD.task, actor, device=torch.device("cpu")) is actor
+    assert learned_policy(WORLD, actor, torch.device("cpu")) is actor
     assert actor.sets is None
 
 

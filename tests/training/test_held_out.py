@@ -31,17 +31,17 @@ from trackmdp.training.evaluator import (
     ExactEvaluator,
     HeldOutEvaluator,
     estimated_kernel,
-    make_evaluator,
 )
 from trackmdp.training.folders import run_of
+from trackmdp.training.group_run import evaluator_of
 from trackmdp.world.model import World
 from trackmdp.world.problem_file import PROBLEM, read_problem
 
 
 def test_the_setting_decides_who_evaluates() -> None:
     world = small_world()
-    assert type(make_evaluator(world)) is ExactEvaluator
-    assert type(make_evaluator(recorded(drawn(world.kernel, 5)))) is HeldOutEvaluator
+    assert type(evaluator_of(world, 0)) is ExactEvaluator
+    assert type(evaluator_of(recorded(drawn(world.kernel, 5)), 0)) is HeldOutEvaluator
 
 
 def test_only_the_held_out_tracks_count() -> None:

@@ -26,9 +26,6 @@ from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError
 from trackmdp.policies.forms import (
     STATE_KEYS,
-    TAKE_ITS_MODE,
-    DrawsError,
-    Rule,
     acting,
     adapted,
     function_rule,
@@ -41,7 +38,7 @@ from trackmdp.policies.lookup import DenseTable, SparseTable, in_window
 from trackmdp.policies.saved import load_policy, save_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.policies.tracker import Tracker
-from trackmdp.policies.unroll import draws, mixture, unrolled
+from trackmdp.policies.unroll import mixture, unrolled
 from trackmdp.sensing.task import Task
 from trackmdp.sensing.windows import Window
 
@@ -136,7 +133,8 @@ class Policy(TensorDictModuleBase, PolicyTable):
         """
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             known = known_task(task, None)
-            return cls._unrolled(known, function_rule(task, function), "cpu", check=check)
+            rule = function_rule(task, function)
+            return cls(known, unrolled(known, rule, "cpu", check=check))
 
     @classmethod
     def from_module(
@@ -165,18 +163,8 @@ class Policy(TensorDictModuleBase, PolicyTable):
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             module = module if transform is None else transformed(module, transform)
             known = known_task(task, module)
-            return cls._unrolled(known, module_rule(known, module), device, check=check)
-
-    @classmethod
-    def _unrolled(
-        cls, task: Task, rule: Rule, device: torch.device | str, *, check: bool
-    ) -> Policy:
-        sets = unrolled(task, rule, torch.device(device))
-        if check and draws(task, rule, torch.device(device), sets):
-            raise DrawsError(
-                f"policy: draws at random, so that it has no exact value; {TAKE_ITS_MODE}"
-            )
-        return cls(task, sets)
+            rule = module_rule(known, module)
+            return cls(known, unrolled(known, rule, device, check=check))
 
     # Acting.
 
@@ -315,23 +303,12 @@ def as_policy(task: Task, policy: PolicyLike) -> Policy:
         where = _device_of(policy)
         with acting():
             known = known_task(task, policy)
-            chances = (
-                mixture(known, policy, where) if isinstance(policy, TensorDictModuleBase) else None
-            )
-            if chances is not None:
-                return Policy(known, chances)
-            return Policy._unrolled(known, rule_of(known, policy), where, check=True)
+            sets = mixture(known, policy, where)
+            if sets is None:
+                sets = unrolled(known, rule_of(known, policy), where, check=True)
+        return Policy(known, sets)
     policy.check_fits(task)
     return policy if isinstance(policy, Policy) else Policy.from_table(policy)
-
-
-def actor_table(
-    task: Task, actor: TensorDictModuleBase, *, device: torch.device, check: bool = True
-) -> Policy:
-    """The table of a learner's actor; a `Policy` is one already."""
-    if isinstance(actor, Policy):
-        return actor
-    return Policy.from_module(task, actor, device=device, check=check)
 
 
 def _check_range(name: str, values: Tensor, count: int) -> None:

@@ -7,11 +7,13 @@ take the place of the M cells.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from scipy import sparse
 from tensordict import TensorDict
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, distributions
 from torchrl.envs.utils import ExplorationType, exploration_type
 
@@ -33,36 +35,35 @@ _HISTORY_AT_ONCE = 2**22
 """Entries of the action history in one block; the size of a net's activations follows from it."""
 
 
-def unrolled(task: Task, rule: Rule, device: torch.device) -> sparse.csr_array:
+def unrolled(
+    task: Task, rule: Rule, device: torch.device | str, *, check: bool
+) -> sparse.csr_array:
     """`[keys * (t_max + 1), S]` bool, the sets of a rule; row key * (t_max + 1) + n as in `Policy.sets`.
 
-    Torch's global generators are left as they were.
+    Torch's global generators are left as they were. With `check` the rule is asked again. To compare its answers finds
+    any source of randomness that changes some; torch's global generators, which TorchRL's modules draw from, also show
+    one that seldom does.
+
+    Raises:
+        DrawsError: with `check`, it draws.
     """
+    place = torch.device(device)
     with preserved_global_rng():
-        return _table(task, rule, device)
-
-
-def draws(task: Task, rule: Rule, device: torch.device, sets: sparse.csr_array) -> bool:
-    """Whether a rule with the table `sets` draws: asked again it answers otherwise, or uses torch's generators.
-
-    The first test finds any source of randomness that changes some answer; the second also finds one that seldom does,
-    if it is one of torch's global generators, which TorchRL's modules draw from.
-    """
-    with preserved_global_rng():
+        sets = _table(task, rule, place)
+        if not check:
+            return sets
         # Another place in the random stream than the first time.
         torch.manual_seed(torch.initial_seed() + 1)
         before = _generator_states()
-        again = _table(task, rule, device)
-        moved = any(
-            not torch.equal(*pair) for pair in zip(before, _generator_states(), strict=True)
-        )
+        again = _table(task, rule, place)
+        kept = all(map(torch.equal, before, _generator_states()))
     same = np.array_equal(again.indptr, sets.indptr) and np.array_equal(again.indices, sets.indices)
-    return moved or not same
+    if not (kept and same):
+        raise DrawsError(f"policy: draws at random, so that it has no exact value; {TAKE_ITS_MODE}")
+    return sets
 
 
-def mixture(
-    task: Task, module: TensorDictModuleBase, device: torch.device
-) -> sparse.csr_array | None:
+def mixture(task: Task, module: Any, device: torch.device) -> sparse.csr_array | None:
     """`[keys * (t_max + 1), S]` float64, the probability with which a stochastic actor switches each sensor on.
 
     Exact values need no more than these where they do not depend on the history: the next state then depends on the
@@ -70,7 +71,7 @@ def mixture(
 
     Args:
         task: the task it acts in.
-        module: a module of TorchRL; its distribution must be a Bernoulli per sensor.
+        module: a module or a function; its distribution must be a Bernoulli per sensor.
         device: device of the module.
 
     Returns:

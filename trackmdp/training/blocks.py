@@ -30,8 +30,9 @@ from trackmdp.solvers.partition import Block, blocks, default_halo, narrow_halo,
 from trackmdp.solvers.workers import crew
 from trackmdp.training.callbacks import Callback, Learning, Position
 from trackmdp.training.display import make_console
-from trackmdp.training.evaluator import Score, make_evaluator
+from trackmdp.training.evaluator import Score
 from trackmdp.training.folders import SUMMARY, finished, read_summary
+from trackmdp.training.group_run import evaluator_of
 from trackmdp.training.inputs import identity, problem_of, with_own_classes, words_of, write_inputs
 from trackmdp.training.lock import locked
 from trackmdp.training.run import complete, load_run
@@ -109,7 +110,10 @@ class BlockTrainer(Learning):
             ends = [read_summary(learner.place(number)) for number in range(len(parts))]
         earned = sum(end["frames"] * end["while_collecting"]["reward_per_frame"] for end in ends)
         frames = sum(end["frames"] for end in ends)
-        self._policy, self.evaluator = Policy.from_table(table), make_evaluator(world)
+        self._policy, self.evaluator = (
+            Policy.from_table(table),
+            evaluator_of(world, self.config.seed),
+        )
         self.position = Position(0, frames, time.monotonic() - began, earned)
         score = self.evaluator.score(self._policy)
         if warning := narrow_halo(world, cfg, self.evaluator.upper, score.evaluation):

@@ -119,11 +119,6 @@ class ExactEvaluator(Evaluator):
         self.lower = self.qmdp.aihtr
 
 
-def make_evaluator(problem: Problem) -> Evaluator:
-    """Exact where there is a motion model, else on the held-out tracks."""
-    return HeldOutEvaluator(problem) if isinstance(problem, Recorded) else ExactEvaluator(problem)
-
-
 class HeldOutEvaluator(Evaluator):
     """Evaluates on every held-out track, from its first cell to its end; scores are those of the validation tracks.
 
@@ -201,7 +196,6 @@ def estimated_kernel(tracks: Tracks, size: tuple[int, int]) -> sparse.csr_array:
     """`[M, M]` the motion as `tracks` show it: posterior mean, the prior of a row counting as one move."""
     estimate = KernelEstimate(size, weight=1.0, exit_weight=1.0)
     estimate.add_moves(*tracks.steps(estimate.num_cells))
-    estimate.fit(1)
     # `[M, M + 1]`, the last column being the exit, which a kernel `[M, M]` leaves to its rows' missing mass.
     return estimate.mean()[:, :-1]
 

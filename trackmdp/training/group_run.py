@@ -15,7 +15,8 @@ from tensordict.nn import TensorDictModuleBase
 from trackmdp.algos.common import make_algorithm
 from trackmdp.config import TrainConfig
 from trackmdp.config.roots import OptimalBoundConfig
-from trackmdp.policies.policy import Policy, actor_table
+from trackmdp.policies.policy import Policy
+from trackmdp.recordings.tracks import Recorded
 from trackmdp.seeding import derive, preserved_global_rng
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import evaluate
@@ -27,7 +28,7 @@ from trackmdp.solvers.several.group_value import evaluate_group
 from trackmdp.solvers.several.joint_rule import JointRule
 from trackmdp.solvers.several.merging import Rule
 from trackmdp.solvers.solution import Solution
-from trackmdp.training.evaluator import Evaluator, Score, make_evaluator
+from trackmdp.training.evaluator import Evaluator, ExactEvaluator, HeldOutEvaluator, Score
 from trackmdp.world.group import Group, Subject
 
 _SCORED = 32
@@ -58,19 +59,22 @@ class GroupEvaluator(Evaluator):
 
 
 def evaluator_of(subject: Subject, seed: int) -> Evaluator:
-    """See `make_evaluator`; of several targets a `GroupEvaluator`."""
+    """Exact where there is a motion model, else on the held-out tracks; of several targets a `GroupEvaluator`."""
     if isinstance(subject, Group):
         return GroupEvaluator(subject, seed)
-    return make_evaluator(subject)
+    return HeldOutEvaluator(subject) if isinstance(subject, Recorded) else ExactEvaluator(subject)
 
 
 def learned_policy(
-    subject: Subject, actor: TensorDictModuleBase, device: torch.device, *, check: bool = True
+    subject: Subject, actor: TensorDictModuleBase, device: torch.device
 ) -> Policy | JointRule:
-    """The table of an actor, or of several targets the actor itself; see `actor_table`."""
+    """The table of a learner's actor, or of several targets the actor itself; a `Policy` is a table already."""
     if isinstance(subject, Group):
         return JointRule(subject, actor, device)
-    return actor_table(subject.task, actor, device=device, check=check)
+    if isinstance(actor, Policy):
+        return actor
+    # Learners evaluate a deterministic actor, so that there is no need to ask twice whether it draws.
+    return Policy.from_module(subject.task, actor, device=device, check=False)
 
 
 def joint_policy(

@@ -83,8 +83,7 @@ class Trainer(Training):
 
     def policy(self) -> Any:
         """The policy as it is now; asking for it does not disturb the run."""
-        # Learners evaluate a deterministic actor, so that there is no need to ask twice whether it draws.
-        return learned_policy(self.problem, self.algorithm.actor, self.device, check=False)
+        return learned_policy(self.problem, self.algorithm.actor, self.device)
 
     def run(self) -> Score:
         """Train to the end; returns the score of the last policy.
