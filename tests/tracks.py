@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,14 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.recordings.tracks import Recorded, Tracks
+
+
+def digest_of(tracks: Tracks) -> str:
+    """SHA-256 of all that was recorded."""
+    digest = hashlib.sha256()
+    for part in (tracks.cells, tracks.first, tracks.exits, tracks.names):
+        digest.update(np.ascontiguousarray(part).tobytes())
+    return digest.hexdigest()
 
 
 def by_hand(*tracks: Sequence[int], exits: bool | Sequence[bool] = True) -> Tracks:

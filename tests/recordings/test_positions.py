@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 
 import trackmdp as tm
+from tests.tracks import digest_of
 from trackmdp.errors import UserError, adding
 from trackmdp.recordings.positions import IGNORED, NO_IDENTITY, NO_POSITION, REPEATED, Positions
 from trackmdp.recordings.track_files import read_positions
@@ -333,7 +334,7 @@ def test_a_frame_and_columns_of_ones_own_are_read_as_a_file_is(tmp_path: Path) -
     usual = table.rename(columns={"device": "id", "seen": "time"})
     usual.to_csv(tmp_path / "b.csv", index=False)
     digests = {
-        tm.load_tracks(source, **OPTIONS, **more).tracks.digest()
+        digest_of(tm.load_tracks(source, **OPTIONS, **more).tracks)
         for source, more in (
             (table, {"columns": COLUMNS}),
             (table, {"columns": dict(each.split(":") for each in COLUMNS)}),

@@ -394,6 +394,4 @@ def sumo(stream: BinaryIO) -> Positions:
 
 def _columns(rows: Sequence[tuple[Any, ...]], count: int) -> list[list[Any]]:
     """The columns of rows; empty ones where there are no rows."""
-    return (
-        [list(column) for column in zip(*rows, strict=True)] if rows else [[] for _ in range(count)]
-    )
+    return [[row[place] for row in rows] for place in range(count)]

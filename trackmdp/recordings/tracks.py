@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -72,21 +71,14 @@ class Tracks:
         # max_steps moves have max_steps + 1 cells. A track cut short has no exit any more; one of max_steps + 1 cells
         # leaves on a step too many.
         kept = np.minimum(lengths, max_steps + 1)
-        return Tracks(
-            self.cells[self.places <= max_steps],
-            ends_of(kept),
-            self.exits & (lengths <= max_steps),
-            self.names,
-            self.begins,
-        )
+        cells, exits = self.cells[self.places <= max_steps], self.exits & (lengths <= max_steps)
+        return replace(self, cells=cells, first=ends_of(kept), exits=exits)
 
     def closed(self, num_cells: int) -> Tracks:
         """The tracks with the exit, a cell called M, as the last one where the target left."""
         # np.insert takes places in the old array: M goes before the first cell of the next track.
         cells = np.insert(self.cells, self.first[1:][self.exits], num_cells)
-        return Tracks(
-            cells, ends_of(self.lengths + self.exits), self.exits, self.names, self.begins
-        )
+        return replace(self, cells=cells, first=ends_of(self.lengths + self.exits))
 
     def steps(self, num_cells: int) -> tuple[Indices, Indices]:
         """Cells before and after every step, `[K]` each; M after an exit."""
@@ -126,13 +118,6 @@ class Tracks:
         )
         first = np.flatnonzero(~ends) if anywhere else self.first[:-1]
         return Motion(moves, self.cells, first, goes_on.astype(np.float64), ends=ends)
-
-    def digest(self) -> str:
-        """SHA-256 of all that was recorded."""
-        digest = hashlib.sha256()
-        for part in (self.cells, self.first, self.exits, self.names):
-            digest.update(np.ascontiguousarray(part).tobytes())
-        return digest.hexdigest()
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)

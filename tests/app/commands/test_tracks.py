@@ -13,7 +13,7 @@ import pytest
 from tests.config.cases import composed
 from tests.helpers import headings, small_world
 from tests.reads import record_reads, unread
-from tests.tracks import drawn, write
+from tests.tracks import digest_of, drawn, write
 from tests.training.runs import assert_same_run, at_iteration
 from tests.typed import refused
 from trackmdp.app.cli import main
@@ -107,7 +107,7 @@ def test_a_training_logs_episodes_along_the_validation_tracks(folder: Path) -> N
     with EpisodeReader(folder / "a/episodes.mcap") as reader:
         found = reader.world()
         assert isinstance(found, Recorded)
-        assert found.held_out.digest() == setting.validation.digest()
+        assert digest_of(found.held_out) == digest_of(setting.validation)
 
 
 def test_the_picture_follows_a_held_out_track(folder: Path) -> None:
@@ -336,7 +336,7 @@ def test_positions_are_the_same_from_the_command_line_and_from_python(
     written = read_problem(folder / "a" / PROBLEM)
     assert isinstance(written, Recorded)
     for name in ("tracks", "validation", "held_out"):
-        assert getattr(written, name).digest() == getattr(tracks, name).digest()
+        assert digest_of(getattr(written, name)) == digest_of(getattr(tracks, name))
     assert written.loaded == tracks.loaded
     outside = tracks.loaded["steps outside of the grid"]
     assert outside > 0
