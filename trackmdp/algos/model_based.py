@@ -24,7 +24,7 @@ from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.estimates.path_counts import plan_paths
 from trackmdp.algos.estimates.path_gains import Paths, thinned
 from trackmdp.algos.estimates.path_plans import TRIED, UNJUDGED, Maker, choose_plan
-from trackmdp.algos.estimates.shrinkage import believed_world, least_worth_planning
+from trackmdp.algos.estimates.shrinkage import least_worth_planning, without
 from trackmdp.algos.observed import SensedPaths, observed_paths
 from trackmdp.config.counting import ModelBasedConfig
 from trackmdp.policies.acting import RenewedTable
@@ -144,7 +144,7 @@ class ModelBased(Checkpointed):
         may leave out for good.
         """
         assert isinstance(self.policy, RenewedTable)
-        drawn = self._world(self._estimate.sample(self._rng))
+        drawn = self._world(next(self._estimate.samples(self._rng, 1)))
         self.policy.renew(lifted(self.task, exchange.solve(drawn, 0)))
 
     @property
@@ -212,8 +212,10 @@ class ModelBased(Checkpointed):
         return estimate.believed(self._least)
 
     def _world(self, kernel: sparse.csr_array) -> World:
-        """The task with a `[M, M + 1]` kernel."""
-        return believed_world(self._located, kernel, self._least)
+        """The task with the motion of a `[M, M + 1]` kernel, the last column its exit, without negligible moves."""
+        # Plans on several moves grow with a power of the number of moves, most of which the prior may have added.
+        moves, task = without(kernel[:, :-1], self._least), self._located
+        return World.of(task, moves, modes=task.revealed, max_steps=None)
 
     def _beliefs(self, plan: PolicyTable, world: World) -> dict[str, float]:
         """AIHTR of a plan by the posterior mean, and its standard deviation over kernels that are drawn."""

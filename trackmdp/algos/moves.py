@@ -7,13 +7,14 @@ target's cell and some of its past. All statements on cells and M hold for keys 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
 
+from trackmdp.algos.common import Checkpointed
 from trackmdp.sensing.task import Task
 
 
@@ -101,16 +102,17 @@ def known_as(batch: TensorDictBase) -> str:
     return "key" if "key" in batch.keys() else "last_cell"  # noqa: SIM118 (no dict)
 
 
-def sensed_steps(
-    batch: TensorDictBase, num_cells: int, name: str = "last_cell"
-) -> tuple[Tensor, Tensor]:
-    """Which steps of a collected batch `[B, time]` count, and the cell (or `key`) after each of those, M for outside.
+def sensed_moves(batch: TensorDictBase, num_cells: int) -> tuple[Tensor, Tensor]:
+    """Cells, or keys, before and after each of the steps of a collected batch `[B, time]` that count.
 
     Fully sensed steps of a located target count. Only observations are read: where the tracker located the target, and
     that it left the grid. Steps that did not sense every cell are passed over, also where they detected: to keep the
     detections alone would favour the sensed cells.
+
+    Returns:
+        Two int64 `[K]`; an end of M stands for outside.
     """
-    after = batch["next"]
+    name, after = known_as(batch), batch["next"]
     exited = after["terminated"].squeeze(-1)
     located = (after["steps_since_detection"] == 0) | exited
     # `every` is decided before the move, so that steps are not selected by where the target goes; with all M sensors
@@ -119,10 +121,10 @@ def sensed_steps(
     # Counted: `all` of bools takes ten times as long.
     every = action.count_nonzero(-1) == action.shape[-1]
     whole = every & (batch["steps_since_detection"] == 0) & located
-    return whole, torch.where(exited, num_cells, after[name])
+    return batch[name][whole], torch.where(exited, num_cells, after[name])[whole]
 
 
-class MoveBuffer:
+class MoveBuffer(Checkpointed):
     """Replay buffer of moves from a located cell to the cell sensed next, or to M, outside.
 
     A path drawn from it is put together: any move seen out of a cell may follow any arrival there, since the next move
@@ -133,6 +135,8 @@ class MoveBuffer:
         capacity: moves kept; the oldest go first.
         generator: draws the paths; the buffer lives on its device.
     """
+
+    parts: ClassVar = ("_moves",)
 
     def __init__(self, task: Task, capacity: int, generator: torch.Generator) -> None:
         self.num_cells, self._capacity, self._generator = task.num_keys, capacity, generator
@@ -198,21 +202,12 @@ class MoveBuffer:
         weights = None if self._weights is None else self._weights[ends]
         return torch.cat([ends, end.new_tensor([m])]), CellIndex.of(start, m, weights)
 
-    def state_dict(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Any]:
         """The moves; the generator is its owner's to save."""
-        return {"moves": self._appended()}
+        self._appended()
+        return super().state_dict()
 
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
-        self._moves, self._fresh, self._index = state["moves"].to(self._moves), [], None
-
-
-def sensed_moves(batch: TensorDictBase, num_cells: int) -> tuple[Tensor, Tensor]:
-    """Cells before and after each of the `sensed_steps` of a collected batch `[B, time]`.
-
-    Returns:
-        Two int64 `[K]`; an end of M stands for outside.
-    """
-    name = known_as(batch)
-    whole, end = sensed_steps(batch, num_cells, name)
-    return batch[name][whole], end[whole]
+        super().load_state_dict(state)
+        self._fresh, self._index = [], None

@@ -118,6 +118,8 @@ class InferredMoves(MoveBuffer):
         generator: draws the paths; they come on its device.
     """
 
+    parts: ClassVar = ("_estimate",)
+
     def __init__(self, task: Task, generator: torch.Generator) -> None:
         super().__init__(task, 0, generator)
         self._task, modes = task, task.keys.num_classes
@@ -158,12 +160,3 @@ class InferredMoves(MoveBuffer):
         )
         ends = torch.cat([end.long(), end.new_tensor([self.num_cells]).long()])
         return ends, CellIndex.of(start.long(), self.num_cells, weights)
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """All that was observed; the generator is its owner's to save."""
-        return self._estimate.state_dict()
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from a `state_dict`."""
-        self._estimate.load_state_dict(state)
-        self._index = None

@@ -89,7 +89,9 @@ def test_alike_cells_are_drawn_once() -> None:
     estimate.direct = estimate.counts = counts_of(
         make_world("random_walk", size=10).kernel.toarray(), 30
     )
-    first, second = (estimate.sample(np.random.default_rng(seed)).toarray() for seed in (0, 1))
+    first, second = (
+        next(estimate.samples(np.random.default_rng(seed), 1)).toarray() for seed in (0, 1)
+    )
     np.testing.assert_array_equal(first[44, [43, 45, 34, 54]], first[55, [54, 56, 45, 65]])
     assert first[44, 45] != second[44, 45]
     np.testing.assert_allclose(first.sum(axis=1), 1.0)
@@ -101,7 +103,7 @@ def test_a_drawn_kernel_has_a_way_out_though_no_exit_was_seen() -> None:
     moves = np.tile(np.arange(9), 50)
     estimate.add_moves(moves, np.roll(np.arange(9), 1)[moves])
     for seed in range(5):
-        assert estimate.sample(np.random.default_rng(seed)).toarray()[:, 9].min() >= 1e-9
+        assert next(estimate.samples(np.random.default_rng(seed), 1)).toarray()[:, 9].min() >= 1e-9
 
 
 def test_what_share_cells_says(tmp_path: Path) -> None:

@@ -151,6 +151,7 @@ def test_far_jumps_are_no_guide_to_steps_nearby() -> None:
     count = np.stack([rng.multinomial(200, row) for row in kernel])
     start, end = count.nonzero()
     estimate = KernelEstimate((6, 10), weight=0.1, exit_weight=1.0)
-    estimate.add_moves(start, end, count[start, end].astype(float))
+    times = count[start, end]
+    estimate.add_moves(np.repeat(start, times), np.repeat(end, times))
     believed, jumps = estimate.believed()[:, :-1].toarray(), far & (count > 0)
     assert np.abs(believed - 0.1)[jumps].mean() < 0.5 * np.abs(count / 200 - 0.1)[jumps].mean()

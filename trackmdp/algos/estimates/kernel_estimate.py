@@ -97,12 +97,11 @@ class KernelEstimate:
         """Paths and moves added."""
         return round(self.direct.sum()) + sum(len(part.start) for part in self._censored)
 
-    def add_moves(self, start: IndexArray, end: IndexArray, count: Array | None = None) -> None:
-        """Add moves `[K]` with both ends seen, each once or `count` `[K]` times; `end` is M at the exit."""
+    def add_moves(self, start: IndexArray, end: IndexArray) -> None:
+        """Add moves `[K]` with both ends seen; `end` is M at the exit."""
         # Before the first fit the two are one matrix, and stay so; after it, counts wait for the next `fit`.
         unfitted = self.counts is self.direct
-        count = np.ones(len(start)) if count is None else count
-        self.direct = self.direct + counted(start, end, count, self.direct.shape)
+        self.direct = self.direct + ones_at(start, end, self.direct.shape, np.float64)
         self.counts = self.direct if unfitted else self.counts
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -183,12 +182,8 @@ class KernelEstimate:
         moves.eliminate_zeros()
         return self._kernel(moves, exits[:, 0] / exits.sum(axis=1))
 
-    def sample(self, rng: np.random.Generator) -> sparse.csr_array:
-        """`[M, M + 1]` one kernel drawn from the posterior, censored paths taken at their expected moves."""
-        return next(self.samples(rng, 1))
-
     def samples(self, rng: np.random.Generator, count: int) -> Iterator[sparse.csr_array]:
-        """As many as `count` of them."""
+        """`[M, M + 1]` kernels drawn from the posterior, censored paths taken at their expected moves."""
         moves, exits = self._parameters()
         # Cells that move alike are drawn once: the draws of many would average out.
         alike = None if self.share_cells is False else self._alike()

@@ -47,14 +47,12 @@ class Planned:
         reward: of all paths together.
         moves: on them.
         seen: keys that some path may lead to.
-        rounds: of policy iteration that raised the reward.
     """
 
     plans: KeyPlans
     reward: float
     moves: int
     seen: int
-    rounds: int
 
     @cached_property
     def policy(self) -> PolicyTable:
@@ -133,7 +131,7 @@ def plan_paths(
         rounds: at most so many.
         start: plans to begin with; None: myopic ones, a detection being worth r, and nothing following from it.
     """
-    view, kept = _View(paths), 0
+    view = _View(paths)
     if start is None:
         gains = [np.full(len(step.rows), paths.task.reward) for step in paths.renewal.steps[:-1]]
         first = _Counted(view, gains, paths.times, prior)
@@ -147,8 +145,8 @@ def plan_paths(
         after = paths.follow(tried.table)
         if after.reward <= value.reward:
             break
-        plans, value, kept = tried.plans, after, kept + 1
-    return Planned(plans(), value.reward, paths.moves, len(paths.keys), kept)
+        plans, value = tried.plans, after
+    return Planned(plans(), value.reward, paths.moves, len(paths.keys))
 
 
 class _View:

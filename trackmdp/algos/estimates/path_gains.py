@@ -100,17 +100,13 @@ class Paths:
         """`[K]`, the keys that some path may lead to."""
         return self.renewal.plans
 
-    def acts(self, table: SetTable) -> list[Act]:
-        """Reports and prices of a policy, its plans in the order of `keys`."""
-        owner, cell, found = self.renewal.owner, self.renewal.motion.cell, []
-        for n, step in enumerate(self.renewal.steps[:-1]):
-            report = table.reports(n, owner[step.rows], cell[step.states])
-            found.append((report, table.spent(n, self.task.paid)[owner]))
-        return found
-
     def follow(self, table: SetTable) -> AlongPaths:
         """A policy on all paths, its plans in the order of `keys`."""
-        renewal, acts = self.renewal, self.acts(table)
+        renewal, acts = self.renewal, list[Act]()
+        owner, cell = renewal.owner, renewal.motion.cell
+        for n, step in enumerate(renewal.steps[:-1]):
+            report = table.reports(n, owner[step.rows], cell[step.states])
+            acts.append((report, table.spent(n, self.task.paid)[owner]))
         steps = renewal.passes(acts)
         # Undiscounted: the moves before the end of step n carry γ^(n + 1), of a repeated safe action γ.
         factors = [np.full(renewal.count, self._discount ** -(n + 1)) for n in range(len(steps))]

@@ -145,7 +145,7 @@ def _first(judged: Paths, searched: Sequence[Planned]) -> tuple[int, Planned, fl
 
 def _valued(paths: Paths, plans: KeyPlans) -> Planned:
     """Plans with their reward on paths."""
-    return Planned(plans, along(paths, plans).reward, paths.moves, len(paths.keys), 0)
+    return Planned(plans, along(paths, plans).reward, paths.moves, len(paths.keys))
 
 
 def parted(tracks: Tracks, seed: int) -> tuple[Tracks, Tracks]:
@@ -167,7 +167,7 @@ def _searched(paths: Paths, plan: Planned) -> Planned:
         tried = paths.follow(interleaved(paths.task, sets))
         if tried.reward > plan.reward * (1.0 + _RISE):
             plans = replace(plans, sets=sets)
-            plan = replace(plan, plans=plans, reward=tried.reward, rounds=plan.rounds + 1)
+            plan = replace(plan, plans=plans, reward=tried.reward)
             found = exchanged_keys(paths, sets, tried, _LEAST)
         elif share > _LEAST_SHARE:
             share /= 2

@@ -28,7 +28,6 @@ from scipy.special import betaln
 from trackmdp.arrays.entries import per_row, row_index, with_data
 from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.sensing.task import Task
-from trackmdp.world.model import World
 
 PRECISIONS = (30.0, 300.0, 3000.0)
 """a + b of the Beta(a, b) of the mixture: broad and narrow groups of probabilities."""
@@ -129,13 +128,6 @@ def least_worth_planning(task: Task) -> float:
     """
     paid = task.cost[task.cost > 0]
     return SHARE_OF_PRICE * float(paid.min(initial=task.reward)) / (task.reward + task.safe_cost)
-
-
-def believed_world(task: Task, kernel: sparse.csr_array, least: float) -> World:
-    """The task with the motion of a `[M, M + 1]` kernel, the last column its exit, without moves below `least`."""
-    # Plans on several moves grow with a power of the number of moves, most of which the prior may have added.
-    moves = without(kernel[:, :-1], least)
-    return World.of(task, moves, modes=task.revealed, max_steps=None)
 
 
 def without(moves: sparse.csr_array, least: float) -> sparse.csr_array:
