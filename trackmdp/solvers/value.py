@@ -48,8 +48,9 @@ from trackmdp.world.problem import Problem
 if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its sets
     from trackmdp.policies.policy import PolicyLike
 
-_MOST_GROUPS = 2_500
-"""States up to which each is a group of its own: the factors of more would cost more than they spare."""
+_MOST_GROUPS, _EVENTS_A_GROUP = 1_500, 4
+"""States up to which each is a group of its own, and events a state from which: else factors cost more than they
+spare."""
 
 
 def value_of(
@@ -214,12 +215,13 @@ def first_events(events: Events, motion: Motion) -> IndexArray:
 
 
 def event_groups(motion: Motion, states: IndexArray) -> IndexArray:
-    """`[B]`, 0 to the number of groups - 1: events of one state are a group; of one cell, where states are many.
+    """`[B]`, 0 to the number of groups - 1: events of one state are a group, or of one cell.
 
     What follows an event depends on its key only until the next detection, so that a correction that is constant on
     each state leaves little to iterate: a third of the products with groups of a cell (heading, displacement_gap).
     """
-    each = states if motion.num_states <= _MOST_GROUPS else motion.cell[states]
+    most = min(_MOST_GROUPS, len(states) // _EVENTS_A_GROUP)
+    each = states if motion.num_states <= most else motion.cell[states]
     rank = np.cumsum(np.bincount(each) > 0) - 1
     return rank[each]
 
