@@ -34,7 +34,7 @@ def test_chain_returns_by_hand() -> None:
     )
     cost = torch.tensor([[0.25] * 5, [0.5] * 5])
     value = torch.tensor([[2.0] * 5, [4.0] * 5, [6.0] * 5])
-    returns = chain_returns(hits, inside, cost, value, reward=1.0, safe_cost=5.0, discount=0.5)
+    returns = chain_returns(hits, inside, cost, value, safe_cost=5.0, discount=0.5)
     forced = 1 - 5 + 0.5 * 6
     assert returns[2].tolist() == [forced, forced, forced, 0.0, 0.0]
     assert returns[1].tolist() == [0.5 * forced - 0.5, 3.0 - 0.5, 0.5 * forced - 0.5, 0.0, 0.0]
@@ -73,7 +73,7 @@ def test_chain_returns_pay_what_the_episode_pays(
     hits = torch.rand(t_max + 1, paths, generator=rng) < 0.4
     cost = torch.rand(t_max + 1, paths, generator=rng)
     value = torch.randn(t_max + 2, paths, generator=rng)
-    returns = chain_returns(hits, inside, cost, value, reward=1.0, safe_cost=7.0, discount=discount)
+    returns = chain_returns(hits, inside, cost, value, safe_cost=7.0, discount=discount)
     for path in range(paths):
         expected = [
             walked(n, hits[:, path], inside[:, path], cost[:, path], value[:, path], discount)

@@ -48,12 +48,11 @@ def chain_returns(
     set_cost: Tensor,
     value: Tensor,
     *,
-    reward: float,
     safe_cost: float,
     discount: float,
     repeated: tuple[Tensor, Tensor] | None = None,
 ) -> Tensor:
-    """Return of a chain of sets from each of its steps on, along paths, the target undetected until then.
+    """Return of a chain of sets from each of its steps on, along paths, the target undetected until then; r = 1.
 
     Backwards from the safe action, which locates: G_{T+1} = r - D + γV(y), G_n = r + γV(y) - c(A_n) if y is in A_n,
     else γG_{n+1} - c(A_n), where y is the cell the target moves to at that step; 0 once the target has left. A sensor
@@ -64,7 +63,6 @@ def chain_returns(
         inside: bool `[T+2, B]`, whether the target is in the grid after the move.
         set_cost: `[T+1, B]`, c(A_n), the cost of the sensors on.
         value: `[T+2, B]`, V(y).
-        reward: r.
         safe_cost: D.
         discount: γ.
         repeated: `[B]` each, p_s(y) and L(y), the value of the target being in y where the safe action comes next;
@@ -73,7 +71,7 @@ def chain_returns(
     Returns:
         `[T+2, B]`.
     """
-    found = reward + discount * value
+    found = 1.0 + discount * value
     last = (
         found[-1]
         if repeated is None

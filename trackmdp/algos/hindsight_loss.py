@@ -418,7 +418,6 @@ class HindsightLoss(nn.Module):
         """The returns of chains (`chain_returns`) that end with the safe action, the target then in `end` `[B]`."""
         return chain_returns(
             *steps,
-            reward=1.0,
             safe_cost=self.safe_cost,
             discount=self.discount,
             repeated=self._repeated(end, value),

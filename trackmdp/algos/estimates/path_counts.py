@@ -296,18 +296,17 @@ class _Counted:
         """The sets after keys that were not seen."""
         view, shared, task = self._view, self._shared[n], self._view.paths.task
         classes = task.keys.num_classes
-        start, known = np.divmod(keys, classes)
+        known = keys % classes
         least = float(task.prices.min()) if task.coverage is None else 0.0
         # Keys of one class at a time: few displacements are worth a sensor after it, from any cell.
         order = np.argsort(known.astype(np.min_scalar_type(classes)), kind="stable")
         ends = np.cumsum(np.bincount(known, minlength=classes))
         rows, columns = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
-        for each, (high, most) in enumerate(zip(ends, shared.most, strict=True)):
-            at = order[ends[each - 1] if each else 0 : high]
+        for at, most in zip(np.split(order, ends[:-1]), shared.most, strict=True):
             wanted = np.flatnonzero(most > least)
             if not (len(at) and len(wanted)):
                 continue
-            value = shared.of_class(each, start[at], wanted)
+            value = shared.after(keys[at], wanted)
             on = view.sets(keys[at], np.where(value > least, value, 0.0), wanted).tocoo()
             rows.append(at[on.row])
             columns.append(on.col)
@@ -384,15 +383,12 @@ class _Shared:
 
     def after(self, keys: IndexArray, local: IndexArray) -> Array:
         """`[B, W]` gains of displacements `local` `[W]` after `keys` `[B]`."""
-        row, known = self.row[self.keys.cell(keys)], keys % self.keys.num_classes
+        # Each row of the lift once with each class: most cells are never seen, and all those have the last one.
+        classes = self.keys.num_classes
+        pairs = self.row[self.keys.cell(keys)] * classes + keys % classes
+        pairs, place = np.unique(pairs, return_inverse=True)
+        row, known = np.divmod(pairs, classes)
         gains = self.common[known[:, None], local] * self.lift[row[:, None], local]
-        return gains * self.scale[row, known][:, None]
-
-    def of_class(self, known: int, start: IndexArray, local: IndexArray) -> Array:
-        """`[B, W]` gains of displacements `local` `[W]` after the class `known` and cells `start` `[B]`."""
-        # Each row of the lift once: most cells are never seen, and all those have the last one.
-        row, place = np.unique(self.row[start], return_inverse=True)
-        gains = self.common[known, local] * self.lift[np.ix_(row, local)]
         return (gains * self.scale[row, known][:, None])[place]
 
 
