@@ -163,6 +163,13 @@ def test_large_systems_of_keys_are_iterated_to_the_same_value(
     assert key_visits(world, policy) == pytest.approx(visits, abs=1e-9)
 
 
+def test_systems_of_keys_with_modes_take_few_products(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Events of one state are a group: with groups of a cell the error is 300 times as large."""
+    world = headings(6, memory="displacement")
+    monkeypatch.setattr(linear, "_MOST_PRODUCTS", 10)
+    assert evaluate(world, random_policy(world, 1)).error < 1e-6
+
+
 def test_a_kernel_that_never_exits_has_no_value() -> None:
     world = World(np.full((4, 4), 0.25), 2, cost=0.1, t_max=1, max_steps=9)
     with pytest.raises(UserError, match="never exits"):
