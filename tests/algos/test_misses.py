@@ -57,7 +57,6 @@ def test_returns_take_the_mean_over_the_reports() -> None:
         torch.ones(2, 1, dtype=torch.bool),
         torch.tensor([[0.1]]),
         torch.tensor([[4.0], [2.0]]),
-        reward=1.0,
         safe_cost=5.0,
         discount=0.5,
     )
@@ -104,7 +103,6 @@ def test_a_safe_action_that_misses_is_repeated() -> None:
         torch.ones(2, 1, dtype=torch.bool),
         torch.tensor([[0.0]]),
         torch.tensor([[4.0], [2.0]]),
-        reward=1.0,
         safe_cost=5.0,
         discount=0.5,
         repeated=(torch.tensor([0.25]), torch.tensor([-8.0])),
