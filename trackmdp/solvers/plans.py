@@ -111,10 +111,12 @@ class Plans:
         """W `[E_before, C]` before step t of set `on` `[G, C]`, followed by `later` `[E, C]` where it misses."""
         # W_t(i) = sum_j P_ij [h_j (r + V(j)) + (1 - h_j) W_{t+1}(j)] - c(A_t) P_in(i), h_j the probability of a report.
         turn = self.turns[t - 1]
-        report = turn.choice.report(on)
-        gross = turn.moves @ (later + report * (self.detected[t - 1] - later))
-        paid = self.layout.pay(t) @ on
-        return gross - paid[self.layout.rows[t - 1]] * turn.stay[:, None]
+        # In place: new arrays would take as long as the sums.
+        ahead = (self.detected[t - 1] - later) * turn.choice.report(on)
+        ahead += later
+        paid = (self.layout.pay(t) @ on)[self.layout.rows[t - 1]]
+        paid *= turn.stay[:, None]
+        return turn.moves @ ahead - paid
 
     def after(self, sets: Sequence[AnyArray], since: int = 0) -> list[Array]:
         """W after the steps since + 1 ... H, `[E, C]` each, when `sets` go on; the first of them is not read."""
