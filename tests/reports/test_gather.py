@@ -18,6 +18,7 @@ from tests.reports.sweeps import VERSIONS, write_curve, write_run, write_sweep
 from trackmdp.config import load_run_config
 from trackmdp.durable import write_json, write_sealed
 from trackmdp.errors import UserError
+from trackmdp.policies.saved import load_policy, save_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.reports import watch
 from trackmdp.reports.finished import MOST_POINTS, averaged_sets
@@ -357,3 +358,11 @@ def test_a_folders_name_is_a_name_everywhere(
     said = capsys.readouterr().out
     assert "\x1b" not in said
     assert "[x]: done" in said
+
+
+def test_a_policy_without_its_values_is_listed_too(sweep: Path) -> None:
+    place = sweep / f"a2c-0.16-{gather_runs(sweep).maps[0].seed}"
+    table, _ = load_policy(place / "policy.npz")
+    save_policy(place / "policy.npz", table)
+    write_summary(place, read_summary(place))
+    assert "not the policy of this run" in reasons(gather_runs(sweep))[place.name]

@@ -138,7 +138,8 @@ def read_map(place: Path, run: FinishedRun, world: str, method: str) -> Mapped |
     if problem is None:
         return None
     table, value = load_policy(place / "policy.npz")
-    assert value is not None  # the digest is the run's, which saves a policy with its values
+    if table.task.size != problem.size or table.task.t_max != problem.t_max or value is None:
+        raise UserError(f"{place / 'policy.npz'}: not the policy of this run")
     if not table.deterministic:
         raise UserError(f"{place / 'policy.npz'}: sets drawn at random, so that there is no map")
     # `[keys (t_max + 1), M]`: cells in view of the sensors on.
