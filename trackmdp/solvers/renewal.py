@@ -82,7 +82,7 @@ class Renewal:
         alone = self.keys.num_classes == self.motion.modes == 1 and self.motion.ends is None
         return self.task.size if alone else None
 
-    @property
+    @cached_property
     def groups(self) -> tuple[int, int] | IndexArray:
         """`size`, or `[B]` the groups of the events."""
         return event_groups(self.motion, self.states) if self.size is None else self.size
