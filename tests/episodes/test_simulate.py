@@ -161,7 +161,7 @@ def test_by_hand() -> None:
     assert episode.belief is not None
     assert episode.target[:4].tolist() == [1, 2, 3, 0]
     assert episode.misses[:4].tolist() == [0, 1, 0, 1]
-    assert np.where(episode.located, episode.target, -1)[:4].tolist() == [-1, 2, -1, -1]
+    assert episode.observation[:4].tolist() == [-1, 2, -1, -1]
     assert episode.last_cell[:4].tolist() == [0, 0, 2, 2]
     np.testing.assert_allclose(episode.reward[:4], [-0.3, 1.7, -0.3, -0.3], rtol=1e-6)
     np.testing.assert_allclose(episode.returns[:4], [-0.3, 1.4, 1.1, 0.8], rtol=1e-6)

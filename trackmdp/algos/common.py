@@ -104,7 +104,14 @@ class Checkpointed:
             elif hasattr(part, "load_state_dict"):
                 part.load_state_dict(saved)
             else:
-                setattr(self, name, saved.cpu().numpy() if isinstance(part, np.ndarray) else saved)
+                setattr(self, name, _as(part, saved))
+
+
+def _as(part: Any, saved: Any) -> Any:
+    """A saved value as the kind that the part is of, on its device."""
+    if isinstance(part, Tensor):
+        return saved.to(part)
+    return saved.cpu().numpy() if isinstance(part, np.ndarray) else saved
 
 
 def _state(part: Any) -> Any:

@@ -66,7 +66,7 @@ class ModelBased(Checkpointed):
         device: where the policies' tables live; the estimates are on the CPU.
     """
 
-    parts: ClassVar = (
+    parts: ClassVar[tuple[str, ...]] = (
         "_iteration",
         "_frames",
         "_sensors",

@@ -136,7 +136,7 @@ class MoveBuffer(Checkpointed):
         generator: draws the paths; the buffer lives on its device.
     """
 
-    parts: ClassVar = ("_moves",)
+    parts: ClassVar[tuple[str, ...]] = ("_moves",)
 
     def __init__(self, task: Task, capacity: int, generator: torch.Generator) -> None:
         self.num_cells, self._capacity, self._generator = task.num_keys, capacity, generator

@@ -33,7 +33,7 @@ class SegmentBuffer(Checkpointed):
         judge: seed by which recordings are kept from the segments, to judge the learned policies by; None: none.
     """
 
-    parts: ClassVar = ("judge", "_paths")
+    parts: ClassVar[tuple[str, ...]] = ("judge", "_paths")
 
     def __init__(
         self,
@@ -118,7 +118,7 @@ class InferredMoves(MoveBuffer):
         generator: draws the paths; they come on its device.
     """
 
-    parts: ClassVar = ("_estimate",)
+    parts: ClassVar[tuple[str, ...]] = ("_estimate",)
 
     def __init__(self, task: Task, generator: torch.Generator) -> None:
         super().__init__(task, 0, generator)

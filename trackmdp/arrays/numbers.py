@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.config.sensors import LARGEST_PRICE
 from trackmdp.errors import UserError
 
-Range = tuple[Callable[[Array], BoolArray], str]
+Range: TypeAlias = tuple[Callable[[Array], BoolArray], str]
 """A test of numbers, and its range in words."""
 
 PRICES: Range = (

@@ -100,10 +100,13 @@ class NetworkConfig(EveryTaskConfig):
         """Two networks and their optimiser; their hidden units for each target of a batch."""
         found, targets = {"algo.hidden": networks(task, self.hidden)}, together(root)
         if targets > 1:
-            # What goes through the networks together: a batch of a replay buffer, else the collected one.
-            rows = targets * getattr(self, "batch_size", root.collector.frames_per_batch)
+            rows = targets * self.learned_at_once(root)
             found["targets.count"] = _PASSES * rows * self.hidden * BYTES["float32"]
         return found
+
+    def learned_at_once(self, root: Any) -> int:
+        """Frames that go through the networks together."""
+        return int(root.collector.frames_per_batch)
 
 
 class ActorCriticConfig(NetworkConfig):
@@ -185,6 +188,10 @@ class DqnConfig(NetworkConfig):
         return super().needs(task, root) | {
             "algo.buffer_size": self.buffer_size * (transition + priority)
         }
+
+    def learned_at_once(self, root: Any) -> int:
+        """Frames that go through the networks together."""
+        return self.batch_size
 
 
 class CollectorConfig(ChoiceConfig):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -84,11 +85,11 @@ class Choice:
     action: Tensor | None = None
 
 
-Decides = Callable[[States, Tensor | None], Choice]
+Decides: TypeAlias = Callable[[States, Tensor | None], Choice]
 """In B states, given `[B, num_draws]` draws, uniform in [0, 1); None where none are taken."""
-Acts = Callable[[States, Tensor | None], Tensor]
+Acts: TypeAlias = Callable[[States, Tensor | None], Tensor]
 """The same, giving the action `[B, S]` itself."""
-Asks = Callable[[States, Tensor], Tensor]
+Asks: TypeAlias = Callable[[States, Tensor], Tensor]
 """Given the history `[B, t_max + 1, S]`."""
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,7 @@ from trackmdp.notebook.card import Card, Carded, Facts, decimal
 from trackmdp.sensing.task import Task
 from trackmdp.sensing.windows import Window
 
-Floats = npt.NDArray[np.float32]
+Floats: TypeAlias = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -59,6 +59,11 @@ class Recording(Carded):
 
     def __len__(self) -> int:
         return len(self.target)
+
+    @cached_property
+    def observation(self) -> Indices:
+        """`[T]` the cell in which the target was located by the step, -1 if in none; of K targets `[T, K]`."""
+        return np.where(self.located, self.target, -1)
 
     @property
     def last_cell(self) -> Indices:

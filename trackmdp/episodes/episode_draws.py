@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 from trackmdp.arrays.types import AnyArray, IndexArray
 from trackmdp.seeding import derive
 
-Columns = dict[str, AnyArray]
+Columns: TypeAlias = dict[str, AnyArray]
 
 _BLOCK = 256  # draws taken from an episode's generator at a time; part of the meaning of a seed, so never to be changed
 

@@ -9,7 +9,7 @@ import base64
 import json
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -30,7 +30,7 @@ _EACH = 4 + 4 + 1
 _AT_ONCE = 2**22
 """Numbers of a layer that are made together, of several steps."""
 
-Box = tuple[int, int, int, int]
+Box: TypeAlias = tuple[int, int, int, int]
 """Top, bottom, left and right, ends excluded."""
 
 _CELL = np.dtype([("belief", "<f4"), ("policy", "<f4")])
@@ -86,7 +86,7 @@ def grid_messages(
         }
 
 
-_Layer = tuple[AnyArray, Box]
+_Layer: TypeAlias = tuple[AnyArray, Box]
 
 
 def _layers(

@@ -164,7 +164,7 @@ class EpisodeLogger(Callback):
 
         def tell(line: str) -> None:
             self._lost = line
-            trainer.console.print(line)
+            trainer.console.print(line, markup=False)
 
         self._log = EpisodeLog(
             self._folder,

@@ -75,7 +75,7 @@ class Form:
             # Cells are numbered from the top left, a plot's y axis points upwards: in 3 rows of 4, cell 5 is at x = 1,
             # y = 1, cell 0 at x = 0, y = 2.
             "target_y": np.where(there, rows - 1 - episode.target // columns, -1),
-            "obs": np.where(episode.located, episode.target, -1),
+            "obs": episode.observation,
             **inside,
             "reward": episode.reward.astype(np.float64),
             "ep_return": episode.returns,

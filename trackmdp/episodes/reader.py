@@ -31,7 +31,7 @@ from trackmdp.world.problem import Problem
 from trackmdp.world.problem_file import PROBLEM, problem_in
 
 
-class EpisodeReader(ExitStack):
+class EpisodeReader:
     """The episodes of a finished log, by number.
 
     `reader[12]` is episode 12 as a TensorDict `[T]` with the keys of `TrackEnv`, iteration yields one after another,
@@ -45,10 +45,8 @@ class EpisodeReader(ExitStack):
     """
 
     def __init__(self, file: Path | str) -> None:
-        super().__init__()
         self.file = Path(file)
         self._container = Container(self.file)
-        self.callback(self._container.stream.close)
         self._built: Problem | Group | None = None
         # A constructor that raises leaves nobody to close the file.
         with ExitStack() as opened, reading(self.file):
@@ -70,6 +68,16 @@ class EpisodeReader(ExitStack):
         index = self.attachment("episodes.json", self.end["episodes.json.sha256"])
         self.rows: list[dict[str, Any]] = json.loads(index)
         self._rows = {row["episode"]: row for row in self.rows}
+
+    def __enter__(self) -> EpisodeReader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._container.stream.close()
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 
 from trackmdp.errors import UserError
 from trackmdp.machine import check_free
 
-Size = int | Sequence[int]
+Size: TypeAlias = int | Sequence[int]
 """Size of a grid as a user gives it: one number for a square, or rows and columns."""
 
 

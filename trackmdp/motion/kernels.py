@@ -143,12 +143,8 @@ def _moved(
     grid: tuple[int, int], cells: Indices, offsets: _Offsets, *, clip: bool
 ) -> tuple[Indices, BoolArray]:
     """`[B, K]` the cells at `offsets` `[B, K, 2]` from `cells` `[B]`, and whether they are in the grid."""
-    row, column = (
-        place[:, None] + offset
-        for place, offset in zip(
-            np.divmod(cells, grid[1]), np.moveaxis(offsets, -1, 0), strict=True
-        )
-    )
+    row, column = np.divmod(cells[:, None], grid[1])
+    row, column = row + offsets[..., 0], column + offsets[..., 1]
     if clip:
         row, column = row.clip(0, grid[0] - 1), column.clip(0, grid[1] - 1)
     return cell_at(grid, row, column)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 from trackmdp.errors import UserError
 from trackmdp.notebook.pictures import picture_of
@@ -16,7 +16,7 @@ MOST_LINES, WIDE = 12, 100
 NONE = "–"
 """Stands for a figure that is not known."""
 
-Facts = dict[str, str]
+Facts: TypeAlias = dict[str, str]
 """Name of a figure -> its value, in the order of the card."""
 
 

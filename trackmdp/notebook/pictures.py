@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -52,7 +52,7 @@ class Lines:
     levels: Mapping[str, float] = field(default_factory=dict)
 
 
-Picture = Heat | Lines
+Picture: TypeAlias = Heat | Lines
 
 
 def picture_of(shown: Any) -> Picture | None:

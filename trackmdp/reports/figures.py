@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -107,7 +108,7 @@ def _count(lines: Sequence[Line]) -> str:
     return f"n = {'–'.join(map(str, dict.fromkeys((counts[0], counts[-1]))))}"
 
 
-Panel = tuple[str, dict[float, str]]
+Panel: TypeAlias = tuple[str, dict[float, str]]
 """A title, and price of a sensor, rising -> world: worlds that are the same but for that price."""
 
 

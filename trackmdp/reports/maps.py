@@ -6,6 +6,7 @@ On a large grid the number of sensors in place of the sets, and means over squar
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import TypeAlias
 
 import numpy as np
 
@@ -35,8 +36,8 @@ _AFTER = ("just located (n = 0)", "after one miss (n = 1)")
 _SIDE = 0.92
 """Side of a drawn cell: the gap shows the grid without lines."""
 
-_Size = tuple[int, int]
-_Tiles = dict[str, Array]
+_Size: TypeAlias = tuple[int, int]
+_Tiles: TypeAlias = dict[str, Array]
 """Numbers `[rows of tiles, columns of tiles]` by heading."""
 
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
-from typing import Any
+from typing import Any, TypeAlias
 
 from trackmdp.notebook.card import counted_words
 from trackmdp.reports import figures, idea, maps, summaries, tradeoffs
@@ -17,7 +17,7 @@ from trackmdp.reports.style import Figure, Say
 from trackmdp.reports.tables import Column, Table, paragraphs
 from trackmdp.untrusted import printable
 
-Part = str | Table | Sequence[Figure]
+Part: TypeAlias = str | Table | Sequence[Figure]
 
 
 @dataclass(frozen=True)

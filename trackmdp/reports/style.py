@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # an extra, and a second to import
     from matplotlib import figure
 
 Canvas: TypeAlias = "figure.Figure"
-Say = Callable[[str], None]
+Say: TypeAlias = Callable[[str], None]
 """Receives short progress messages."""
 
 WIDTH = 4.3

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.resources import files
-from typing import Any
+from typing import Any, TypeAlias
 
 from trackmdp.durable import csv_text
 from trackmdp.untrusted import no_formula, printable
 
-Cell = float | int | str | bool | None
-Rows = list[list[Cell]]
+Cell: TypeAlias = float | int | str | bool | None
+Rows: TypeAlias = list[list[Cell]]
 
 _LATEX = {letter: f"\\{letter}" for letter in "{}$&%#_"} | {
     "\\": r"\textbackslash{}",

@@ -110,10 +110,8 @@ class BlockTrainer(Learning):
             ends = [read_summary(learner.place(number)) for number in range(len(parts))]
         earned = sum(end["frames"] * end["while_collecting"]["reward_per_frame"] for end in ends)
         frames = sum(end["frames"] for end in ends)
-        self._policy, self.evaluator = (
-            Policy.from_table(table),
-            evaluator_of(world, self.config.seed),
-        )
+        self._policy = Policy.from_table(table)
+        self.evaluator = evaluator_of(world, self.config.seed)
         self.position = Position(0, frames, time.monotonic() - began, earned)
         score = self.evaluator.score(self._policy)
         if warning := narrow_halo(world, cfg, self.evaluator.upper, score.evaluation):

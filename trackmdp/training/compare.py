@@ -183,8 +183,7 @@ def _of_group(group: Group, rules: Mapping[str, Rule]) -> Comparison:
         Compared(name, {key: getattr(each, key) for key in FIGURES}, each.less(first).aihtr)
         for name, each in found.items()
     )
-    units = ("simulated episode",) if group.recorded is None else ("group", " of held-out tracks")
-    return Comparison(rows, None if exact else len(first.totals), units)
+    return Comparison(rows, None if exact else len(first.totals), first.units)
 
 
 M = TypeVar("M")

@@ -95,9 +95,13 @@ class GroupEvaluation(Carded):
         """What the figures are means over, and whether they have intervals."""
         if self.exact:
             return "exact"
-        kind = ("simulated episode",) if self.controls else ("group", " of held-out tracks")
         interval = "" if self.aihtr.low is None else ", 95 %"
-        return f"{counted_words(len(self.totals), *kind)}{interval}"
+        return f"{counted_words(len(self.totals), *self.units)}{interval}"
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The word for one of the units that totals are of, and what follows it; see `counted_words`."""
+        return ("simulated episode",) if self.controls else ("group", " of held-out tracks")
 
     def card(self) -> Card:
         """The figures with their intervals."""
