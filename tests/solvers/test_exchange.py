@@ -59,6 +59,17 @@ def test_one_round_gains_most_of_what_all_of_them_gain() -> None:
     assert 0.5 < (once.mean() - before.mean()) / (after.mean() - before.mean()) < 1.0 - 1e-6
 
 
+def test_what_exchange_has_settled_is_not_searched_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """But where some plans were left out, or its rounds ended, it goes on."""
+    world = make_world("drift", size=5, t_max=1, cost=0.3, persistence=0.5)
+    start = Found(renewal := Renewal(world, world.motion), search.clocked_sets(renewal))
+    one, left = exchange.exchanged(start, rounds=1), exchange.exchanged(start, go_on=lambda: False)
+    found = exchange.exchanged(start)
+    assert (one.settled, left.settled, found.settled) == (False, False, True)
+    monkeypatch.setattr(exchange, "exchange", lambda *_: pytest.fail("searched again"))
+    assert exchange.exchanged(found) is found
+
+
 @settings(
     max_examples=30, derandomize=True
 )  # a search, not a proof: these 30 have to come out, others may not

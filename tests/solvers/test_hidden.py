@@ -68,10 +68,12 @@ def test_annealed_and_crossed_policies_end_higher(monkeypatch: pytest.MonkeyPatc
     """On 3 x 3 cells a run of `model_based` ended at 37.2789, homotopies below it."""
     world, values = make_world("heading", size=3), []
     misses = world.but(detection=0.8)
-    for limit in ("", "_MOST_CROSSED", "_MOST_ANNEALED"):
-        if limit:
-            monkeypatch.setattr(hidden, limit, 0)
-        values.append([evaluate(each, hidden.best_found(each)).aihtr for each in (world, misses)])
+    effort = hidden.WHOLE
+    for changes in ({}, {"crossed": 0.0}, {"annealed": 0}):
+        effort = effort._replace(**changes)
+        values.append(
+            [evaluate(each, hidden.best_found(each, effort)).aihtr for each in (world, misses)]
+        )
     (both, missed), (annealed, less), (led, least) = values
     assert both >= annealed > 37.2789 > led
     assert missed > 11.1 > less > least
@@ -80,7 +82,7 @@ def test_annealed_and_crossed_policies_end_higher(monkeypatch: pytest.MonkeyPatc
 def test_what_is_found_is_no_worse_than_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
     """One homotopy ends lower than all searches; begun from their policy it ends no lower than that."""
     world = make_world("heading", size=3, memory="cell").but(detection=0.8)
-    best = hidden.best_found(world, effort=0.1)
+    best = hidden.best_found(world, hidden.WHOLE._replace(crossed=0.1))
     for limit in ("_MORE_EVENTS", "_MOST_WORK", "_MOST_CROSSED"):
         monkeypatch.setattr(hidden, limit, 0)
     least, kept, again = (
@@ -147,8 +149,8 @@ def test_no_sets_are_searched_twice_and_a_search_that_finds_nothing_new_ends(
 def test_less_effort_crosses_fewer_policies(monkeypatch: pytest.MonkeyPatch) -> None:
     world, crossed = make_world("heading", size=3), list[int]()
     monkeypatch.setattr(hidden.Search, "crossed", lambda *a: crossed.append(a[2]) or a[1])
-    for effort in (1.0, 0.5, 0.0):
-        hidden.best_found(world, effort=effort)
+    for share in (1.0, 0.5, 0.0):
+        hidden.best_found(world, hidden.WHOLE._replace(crossed=share))
     assert crossed == [199, 199, 199, 199, 199, 199]
 
 
@@ -184,10 +186,10 @@ def test_where_a_search_takes_long_some_are_annealed_in_place_of_homotopies(
         monkeypatch.setattr(
             hidden, name, lambda *a, _n=name, _m=made, **k: begun.append(_n) or _m(*a, **k)
         )
-    alone = hidden.best_found(world, effort=0.0)
+    alone = hidden.best_found(world, hidden.WHOLE._replace(crossed=0.0))
     assert begun == ["follow_credit"]
     begun.clear()
-    several = hidden.best_found(world, annealed=2, effort=0.0)
+    several = hidden.best_found(world, hidden.WHOLE._replace(crossed=0.0, least=2))
     assert begun == ["anneal", "anneal"]
     assert evaluate(world, several).aihtr != evaluate(world, alone).aihtr
 

@@ -49,10 +49,9 @@ _SAMPLES = 8
 """Kernels drawn for the uncertainty reported."""
 _MOST_CELLS = 1_600
 """Cells up to which plans of pooled moves are tried beside those of paths."""
-_MODES, _MOST_STATES, _ANNEALED, _EFFORT = 12, 500, 2, 0.35
-"""Hidden modes of the motion that is fitted as well, up to so many pairs of a cell and a mode; and in the search for
-its plan the policies that are annealed at least, and the effort. With six modes plans for nine velocities end .04 a
-step lower."""
+_MODES, _MOST_STATES = 12, 500
+"""Hidden modes of the motion that is fitted as well, up to so many pairs of a cell and a mode. With six modes plans for
+nine velocities end .04 a step lower."""
 
 
 class ModelBased(Checkpointed):
@@ -203,7 +202,7 @@ class ModelBased(Checkpointed):
         world = self._fit.world(self.task, self._least)
         if before is not None:
             return exchange.improve(world, before)
-        return hidden.best_found(world, annealed=_ANNEALED, effort=_EFFORT)
+        return hidden.best_found(world, hidden.SHORT)
 
     def _of_moves(self, tracks: Tracks) -> sparse.csr_array:
         """`[M, M + 1]`, the kernel of the moves of `tracks`."""

@@ -147,7 +147,7 @@ def exchanged(
     renewal = policy.renewal
     everywhere = np.ones(len(renewal.plans), dtype=bool)
     tried = everywhere
-    for _ in range(rounds):
+    for _ in range(0 if policy.settled else rounds):
         if policy.visits is None:
             plans = renewal.problem(policy.value)
             some = tried & could_gain(plans, policy)
@@ -162,6 +162,7 @@ def exchanged(
             moved = rows_changed(plans.layout, policy.sets, sets)
             policy, tried = better, moved
         elif tried.all():
+            policy.settled = go_on()  # else some parts were left out
             break
         else:
             tried = everywhere

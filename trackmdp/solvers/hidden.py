@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from operator import attrgetter
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from scipy import sparse
@@ -37,17 +37,39 @@ _MOST_WORK, _CROSSED_WORK = 400_000, 4_000_000
 """What bounds the time: events of all homotopies, and as many of all annealed policies; as how many an event or entry
 counts where sensors share cells; entries of the steps of all annealed policies, where these are more, and of crossed
 ones."""
-_ROUNDS = 20
-"""Of exchange, for policies from which the best one is made: the first gain most, and where sensors share cells two."""
-_MOST_LED, _MOST_ANNEALED, _MOST_CROSSED, _MOST_AT_ONCE = 4, 6, 800, 200
-"""Other homotopies, annealed and crossed policies at most, and crossed ones of one search, which more do not improve.
-On three by three cells crossing gains up to .003 a step."""
+_MOST_CROSSED, _MOST_AT_ONCE = 800, 200
+"""Crossed policies at most, and those of one search, which more do not improve. On three by three cells crossing gains
+up to .003 a step."""
+_LEAST_ROUNDS = 2
+"""Of exchange, where sensors share cells."""
 _OLD, _ALIKE = 40, 1e-6
 """A search ends after so many policies in a row that were found before, up to this relative difference."""
 
 _worth = attrgetter("aihtr")
 Watch: TypeAlias = Callable[[Found, float], bool]
 """Takes the best policy so far and the share of the work that is done; whether to go on."""
+
+
+class Effort(NamedTuple):
+    """How far to search.
+
+    Attributes:
+        led: homotopies at most.
+        annealed: annealed policies at most.
+        least: annealed policies at least; in place of homotopies, where a search takes long.
+        crossed: share of the crossed policies.
+        rounds: of exchange, for policies from which the best one is made: the first gain most.
+    """
+
+    led: int
+    annealed: int
+    least: int
+    crossed: float
+    rounds: int
+
+
+WHOLE, SHORT = Effort(5, 6, 0, 1.0, 20), Effort(4, 4, 2, 0.55, 5)
+"""Of `solve`; and for a motion that is estimated: half the time, for .0005 a step less at most."""
 
 
 def solve(
@@ -111,10 +133,10 @@ def _watching(
     return watch
 
 
-def best_found(world: World, *, annealed: int = 0, effort: float = 1.0) -> PolicyTable:
-    """The policy of `solve`, without its bound; see `Search.run`."""
-    search = Search(world)
-    search.run(annealed=annealed, effort=effort)
+def best_found(world: World, effort: Effort = WHOLE) -> PolicyTable:
+    """The policy of `solve`, without its bound, or one found with less effort."""
+    search = Search(world, effort=effort)
+    search.run()
     return search.best.table
 
 
@@ -124,30 +146,25 @@ class Search:
     Args:
         world: with hidden modes.
         watch: takes the best policy so far and the share of the work that is done; whether to go on.
+        effort: how far to search.
 
     Attributes:
         best: the best policy so far; at first the one that homotopies begin from.
     """
 
-    def __init__(self, world: World, watch: Watch = lambda *_: True) -> None:
+    def __init__(
+        self, world: World, watch: Watch = lambda *_: True, effort: Effort = WHOLE
+    ) -> None:
         self.world, self.renewal = world, Renewal(world, world.motion)
         self.best = self._first = Found(self.renewal, clocked_sets(self.renewal))
-        self._watch, self._done, self._most = watch, 0, 1
+        self._watch, self._done, self._most, self._effort = watch, 0, 1, effort
         # Sets after exchange, by those before: many searches begin from the same ones.
         self._ends: dict[bytes, list[AnyArray]] = {}
 
-    def run(
-        self, *, start: PolicyTable | None = None, annealed: int = 0, effort: float = 1.0
-    ) -> None:
-        """Look for policies from several starts, and cross them.
-
-        Args:
-            start: as of `solve`.
-            annealed: policies to anneal at least; in place of homotopies, where a search takes long.
-            effort: share of the policies that are crossed.
-        """
-        count = int(effort * min(_CROSSED_WORK // self._work, _MOST_CROSSED))
-        led, hot = self._planned(annealed)
+    def run(self, *, start: PolicyTable | None = None) -> None:
+        """Look for policies from several starts, and cross them; `start` is as of `solve`."""
+        count = int(self._effort.crossed * min(_CROSSED_WORK // self._work, _MOST_CROSSED))
+        led, hot = self._planned()
         self._most, pool = led + hot + count + (start is not None), list[Found]()
         for policy in self._starts(start, led, hot):
             pool.append(self.searched(policy))
@@ -170,7 +187,7 @@ class Search:
         if mark in self._ends:
             found = Found(self.renewal, self._ends[mark], policy)
         else:
-            rounds = _ROUNDS // self._slower
+            rounds = max(self._effort.rounds // self._slower, _LEAST_ROUNDS)
             found = exchanged(policy, go_on=self._goes_on, rounds=rounds, exact=False)
             self._ends[mark] = self._ends[_bytes(found.sets)] = found.sets
         self._done += 1
@@ -207,12 +224,13 @@ class Search:
                 break
         return pool
 
-    def _planned(self, least: int) -> tuple[int, int]:
-        """How many homotopies, and annealed policies; of these at least so many."""
+    def _planned(self) -> tuple[int, int]:
+        """How many homotopies, and annealed policies."""
+        effort, least = self._effort, self._effort.least
         more = max(_MORE_EVENTS // (self._slower * self.renewal.count) - 1, 0)
         many = _MOST_WORK // self._work
-        led = 1 + min(more, _MOST_LED) if many or not least else 0
-        return led, min(max(more, many, least), _MOST_ANNEALED)
+        led = min(1 + more, effort.led) if many or not least else 0
+        return led, min(max(more, many, least), effort.annealed)
 
     def _starts(self, start: PolicyTable | None, led: int, annealed: int) -> Iterator[Found]:
         """Policies to search from: a known one, those of homotopies, and annealed ones."""

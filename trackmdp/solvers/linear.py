@@ -242,9 +242,10 @@ class _Level:
             self._blocks = sparse.csr_array(sparse.block_diag([_blocks(*size)] * layers))
         else:
             self._blocks = summing(size, size.max() + 1).T.tocsr()
+        self._sums = self._blocks.T
         # Galerkin: with B [M, blocks] the indicator of the blocks, B^T A B is the system seen by vectors that are
         # constant on each block.
-        coarse = short_indices(sparse.csr_array(self._blocks.T @ system @ self._blocks))
+        coarse = short_indices(sparse.csr_array(self._sums @ system @ self._blocks))
         small = coarse.shape[0] <= _COARSEST or not isinstance(size, tuple)
         self._below: _Level | None = None
         if not small:
@@ -256,7 +257,7 @@ class _Level:
         """`[KM]`, about the solution of system x = `residual`."""
         guess: Array = self._damping * residual
         left = residual - self._system @ guess
-        guess += self._blocks @ self._corrected(self._blocks.T @ left)
+        guess += self._blocks @ self._corrected(self._sums @ left)
         left = residual - self._system @ guess
         left *= self._damping
         guess += left

@@ -123,13 +123,14 @@ class Renewal:
         return np.bincount(self.first, minlength=self.count) / len(self.first)
 
     def passes(self, acts: Iterable[Act]) -> list[Passed]:
-        """The steps of all events under a policy; their figures are complete but for the sensors."""
-        task, found = self.task, []
+        """The steps of all events under a policy, with their rewards alone."""
+        task, count, found = self.task, self.count, []
         mass = np.ones(self.normal)
         for step, (report, spent) in zip(self.steps, acts, strict=False):
-            now, mass = passed(task, step, mass, report, spent, 0.0, self.count)
+            now, mass = passed(task, step, mass, report, spent, None, count)
             found.append(now)
-        return [*found, passed_last(task, self.motion, self.steps[-1], mass, self.count)]
+        last = passed_last(task, self.motion, self.steps[-1], mass, count, figures=False)
+        return [*found, last]
 
     def acts(self, sets: Sequence[AnyArray]) -> Iterator[Act]:
         """Reports and prices of `sets`, or of sensors that are on with such probabilities."""
@@ -144,7 +145,7 @@ class Renewal:
 
         `guessed`: a value near to the policy's is known, so that iteration is faster on a grid of some size.
         """
-        located, gathered = whole_renewals(self.passes(self.acts(sets)), self.count)
+        located, gathered = whole_renewals(self.passes(self.acts(sets)), self.count, figures=1)
         direct = _DIRECT if guessed else DIRECT_CELLS
         tolerance = TOLERANCE if self.single else _SEARCHED
         system = RenewalSystem(located, self.groups, direct=direct, tolerance=tolerance)

@@ -52,6 +52,7 @@ class Found:
 
     Attributes:
         renewal, sets: as given.
+        settled: whether exchange has tried all its plans, and found none better.
         visits: `[B]`, of an episode; None where plans have one event each, and nothing depends on them.
         aihtr: mean value of the starts.
         system: of its values.
@@ -60,7 +61,7 @@ class Found:
     def __init__(
         self, renewal: Renewal, sets: Sequence[AnyArray], near: Found | Array | None = None
     ) -> None:
-        self.renewal, self.sets = renewal, list(sets)
+        self.renewal, self.sets, self.settled = renewal, list(sets), False
         self._guess = near.value if isinstance(near, Found) else near
         self.system, self._earned = renewal.system(sets, guessed=self._guess is not None)
         self.visits: Array | None = None

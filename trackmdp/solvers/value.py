@@ -164,9 +164,11 @@ def _whole_episodes(
     return _figures(world, events, totals, error)
 
 
-def whole_renewals(steps: Iterable[Passed], count: int) -> tuple[sparse.csr_array, Array]:
-    """K `[B, B]` and `[B, 6]` totals of whole renewals."""
-    located, gathered = sparse.csr_array((count, count)), np.zeros((6, count)).T
+def whole_renewals(
+    steps: Iterable[Passed], count: int, figures: int = 6
+) -> tuple[sparse.csr_array, Array]:
+    """K `[B, B]` and the totals of whole renewals, `[B, figures]` as those of the steps."""
+    located, gathered = sparse.csr_array((count, count)), np.zeros((figures, count)).T
     for step in steps:
         located = located + step.located
         gathered += step.totals

@@ -106,6 +106,11 @@ class Step:
     goes_on: BoolArray | None
     begun: int
 
+    @cached_property
+    def back(self) -> sparse.csc_array:
+        """`[E, E_before]`, the moves the other way round."""
+        return self.moves.T
+
 
 class Walk:
     """The steps of all events, one by one; entries that are surely detected need not go on.
@@ -317,7 +322,8 @@ class Passed:
 
     Attributes:
         located: `[B, B]`, probability that this step ends a renewal, and with which event.
-        totals: `[B, 6]`, expected reward, steps in the grid, detections, sensors on, safe actions and steps.
+        totals: `[B, 6]`, expected reward, steps in the grid, detections, sensors on, safe actions and steps; or
+            `[B, 1]`, the reward alone.
     """
 
     located: sparse.csr_array
@@ -330,7 +336,7 @@ def passed(
     mass: Array,
     report: npt.NDArray[np.floating] | float,
     spent: Array | float,
-    sensors: Array | float,
+    sensors: Array | float | None,
     count: int,
 ) -> tuple[Passed, Array]:
     """Carry undetected mass through a step.
@@ -341,34 +347,38 @@ def passed(
         mass: `[E_before]`, undetected before the move.
         report: `[E]`, probability of a report there.
         spent: `[B]`, price of the sensors on, or D for the safe action.
-        sensors: `[B]`, number of sensors on, or 0 for the safe action.
+        sensors: `[B]`, number of sensors on, or 0 for the safe action; None: of all figures only the reward is wanted.
         count: B.
 
     Returns:
         The step of all events, and the mass `[E]` that is left undetected.
     """
-    forced = step.n == task.num_choices
-    goes_on = mass if step.goes_on is None else mass * step.goes_on
-    length = per_row(step.before, goes_on, count)
-    now = mass @ step.moves
+    now = step.back @ mass
     found = now * report
     inside, located = per_row(step.rows, now, count), per_row(step.rows, found, count)
     # Sensors are paid while the target is in the grid, whether or not it is where they look.
-    reward = task.reward * located - spent * inside
-    chosen, forced_actions = (0.0 * inside, inside) if forced else (sensors * inside, 0.0 * inside)
-    # Figure by figure in memory: put together, and summed over steps, five times as fast as event by event.
-    totals = np.array([reward, inside, located, chosen, forced_actions, length]).T
+    figures = [task.reward * located - spent * inside]
+    if sensors is not None:
+        goes_on = mass if step.goes_on is None else mass * step.goes_on
+        nothing, forced = 0.0 * inside, step.n == task.num_choices
+        figures += [inside, located]
+        figures += [nothing, inside] if forced else [sensors * inside, nothing]
+        figures.append(per_row(step.before, goes_on, count))
     onward = transition(found, step.rows, step.following, count)
     if step.missed is not None:
         onward = onward + transition(now - found, step.rows, step.missed, count)
-    return Passed(onward, totals), now - found
+    # Figure by figure in memory: put together, and summed over steps, five times as fast as event by event.
+    return Passed(onward, np.array(figures).T), now - found
 
 
-def passed_last(task: Task, motion: Motion, step: Step, mass: Array, count: int) -> Passed:
+def passed_last(
+    task: Task, motion: Motion, step: Step, mass: Array, count: int, *, figures: bool = True
+) -> Passed:
     """The safe action after the free choices, which leave `mass` `[E_before - begun]` undetected; see `passed`."""
     mass = np.concatenate([mass, np.ones(step.begun)])
     report = 1.0 if task.safe else task.safe_detection[motion.cell[step.states]]
-    return passed(task, step, mass, report, task.safe_cost, 0.0, count)[0]
+    sensors = 0.0 if figures else None
+    return passed(task, step, mass, report, task.safe_cost, sensors, count)[0]
 
 
 def transition(value: Array, rows: IndexArray, columns: IndexArray, count: int) -> sparse.csr_array:

@@ -35,6 +35,9 @@ _WEIGHT = 3.0
 _AT_ONCE = 2**21
 """Unknown cells times displacements worked on at once: some 20 MB an array."""
 
+_MOST_CODES = 2**20
+"""Codes up to which counts are a table of all of them: a look-up takes a tenth of the time of a search."""
+
 Missed: TypeAlias = Callable[[IndexArray, IndexArray], Array]
 """From numbers of unknown cells `[K]` and cells `[K, H]` to the probability of a miss there, `[K, H]`."""
 
@@ -78,13 +81,12 @@ class _Moves:
     Attributes:
         task: its grid.
         moves: `[H]`, the `displacements`.
-        counts: codes of a cell (b), with its `headings` (m) and with the next cell (c), in increasing order, and how
-            often each came before a next cell.
+        counts: how often a cell (b), with its `headings` (m) and with the next cell (c), came before a next cell.
     """
 
     task: Task
     moves: IndexArray
-    counts: Mapping[str, tuple[IndexArray, IndexArray]]
+    counts: Mapping[str, _Counts]
 
     @classmethod
     def of(cls, task: Task, line: Tracks, unknown: BoolArray) -> _Moves:
@@ -99,7 +101,7 @@ class _Moves:
         possible = (after == task.num_cells) | np.isin(shift(task, before, after), moves)
         at, before, after = at[possible], before[possible], after[possible]
         codes = _codes(task, moves, before, headings(task, line, moves)[at], after)
-        counts = {name: np.unique(each, return_counts=True) for name, each in codes.items()}
+        counts = {name: _Counts.of(each) for name, each in codes.items()}
         return cls(task, moves, counts)
 
     def candidates(self, last: IndexArray) -> tuple[IndexArray, BoolArray]:
@@ -133,7 +135,7 @@ class _Moves:
     def _chance(self, cell: IndexArray, mode: IndexArray, after: IndexArray) -> Array:
         """Probability of the next cell."""
         codes = _codes(self.task, self.moves, cell, mode, after)
-        count = {name: _looked_up(*self.counts[name], each) for name, each in codes.items()}
+        count = {name: self.counts[name].looked_up(each) for name, each in codes.items()}
         alone: Array = count["bc"] / np.maximum(count["b"], 1.0)
         return (count["bmc"] + _WEIGHT * alone) / (count["bm"] + _WEIGHT) + _LEAP
 
@@ -146,7 +148,28 @@ def _codes(
     return {"b": cell, "bc": cell * wide + after, "bm": known, "bmc": known * wide + after}
 
 
-def _looked_up(codes: IndexArray, counts: IndexArray, wanted: IndexArray) -> IndexArray:
-    """How often the `wanted` codes were counted."""
-    place, known = among(codes, wanted)
-    return np.where(known, counts[place], 0)
+@dataclass(frozen=True)
+class _Counts:
+    """How often codes came.
+
+    Attributes:
+        codes: those that came, in increasing order; None: all from 0, and one more, which stands for larger ones.
+        times: of each.
+    """
+
+    codes: IndexArray | None
+    times: IndexArray
+
+    @classmethod
+    def of(cls, codes: IndexArray) -> _Counts:
+        """The counts of `codes`, none of them below 0."""
+        if codes.max(initial=0) < _MOST_CODES:
+            return cls(None, np.append(np.bincount(codes), 0))
+        return cls(*np.unique(codes, return_counts=True))
+
+    def looked_up(self, wanted: IndexArray) -> IndexArray:
+        """How often the `wanted` codes came."""
+        if self.codes is None:
+            return np.asarray(self.times[np.minimum(wanted, len(self.times) - 1)])
+        place, known = among(self.codes, wanted)
+        return np.where(known, self.times[place], 0)

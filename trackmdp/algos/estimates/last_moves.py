@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from trackmdp.arrays.types import IndexArray
-from trackmdp.grid.displacements import displacement
 from trackmdp.recordings.tracks import Tracks
 from trackmdp.sensing.task import Task
 
@@ -36,6 +35,8 @@ def heading_after(
 
 
 def shift(task: Task, before: IndexArray, after: IndexArray) -> IndexArray:
-    """One number for each pair of rows and columns moved."""
-    down, across = displacement(task.columns, before, after)
-    return down * (2 * task.columns + 1) + across
+    """One number for each pair of rows and columns moved, on C columns down · (2 C + 1) + across."""
+    # A difference of numbers of the cells, looked up: divisions of all entries would take three times as long.
+    row, column = np.divmod(np.arange(task.num_cells + 1), task.columns)
+    number = row * (2 * task.columns + 1) + column
+    return np.asarray(number[after] - number[before])
