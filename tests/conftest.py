@@ -30,8 +30,7 @@ def pytest_collection_finish() -> None:
 @pytest.fixture
 def little_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where modes are hidden, one start and no crossing: for tests of what is made of a policy, however good it is."""
-    for limit in ("_MOST_CROSSED", "_MOST_ANNEALED", "_MOST_LED"):
-        monkeypatch.setattr(hidden, limit, 0)
+    monkeypatch.setattr(hidden, "WHOLE", hidden.WHOLE._replace(led=1, annealed=0, crossed=0.0))
 
 
 @pytest.fixture

@@ -133,7 +133,7 @@ def _watching(
     return watch
 
 
-def best_found(world: World, effort: Effort = WHOLE) -> PolicyTable:
+def best_found(world: World, effort: Effort | None = None) -> PolicyTable:
     """The policy of `solve`, without its bound, or one found with less effort."""
     search = Search(world, effort=effort)
     search.run()
@@ -146,18 +146,18 @@ class Search:
     Args:
         world: with hidden modes.
         watch: takes the best policy so far and the share of the work that is done; whether to go on.
-        effort: how far to search.
+        effort: how far to search; None: `WHOLE`.
 
     Attributes:
         best: the best policy so far; at first the one that homotopies begin from.
     """
 
     def __init__(
-        self, world: World, watch: Watch = lambda *_: True, effort: Effort = WHOLE
+        self, world: World, watch: Watch = lambda *_: True, effort: Effort | None = None
     ) -> None:
         self.world, self.renewal = world, Renewal(world, world.motion)
         self.best = self._first = Found(self.renewal, clocked_sets(self.renewal))
-        self._watch, self._done, self._most, self._effort = watch, 0, 1, effort
+        self._watch, self._done, self._most, self._effort = watch, 0, 1, effort or WHOLE
         # Sets after exchange, by those before: many searches begin from the same ones.
         self._ends: dict[bytes, list[AnyArray]] = {}
 
