@@ -18,7 +18,16 @@ from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation, pooled
 from trackmdp.solvers.linear import RenewalSystem
-from trackmdp.solvers.walk import Events, Passed, Step, Walk, all_events, passed_last, transition
+from trackmdp.solvers.walk import (
+    Events,
+    Passed,
+    Step,
+    Walk,
+    all_events,
+    passed_last,
+    row_pointer,
+    transition,
+)
 from trackmdp.world.model import World
 from trackmdp.world.problem import Problem, modelled
 
@@ -52,7 +61,7 @@ def believed(problem: Problem, policy: PolicyTable, false_alarm: float) -> Evalu
     for ranked in _ranked(world, policy):
         found, mass = _reports(world, walk.move(), mass, policy, ranked, false_alarm)
         onward, gathered = onward + found.located, gathered + found.totals
-    last = passed_last(world, world.motion, walk.move(), mass, m * m)
+    last = passed_last(world, world.motion, walk.move(), mass)
     system = RenewalSystem(onward + last.located, world.size, direct=_DIRECT)
     gathered += last.totals
     totals = system.solve(gathered)
@@ -124,21 +133,15 @@ def _reports(
     missed, earlier = 1.0 - world.detection[target], own[entry] < place
     quiet = (1.0 - false_alarm) ** (place - earlier) * np.where(earlier, missed[entry], 1.0)
     first = quiet * np.where(mine, world.detection[target[entry]], false_alarm) * now[entry]
-    located = transition(first, step.rows[entry], target[entry] * m + cell, m * m)
-    inside = per_row(step.rows, now, m * m)
+    begins = row_pointer(step.rows[entry], m * m)
+    located = transition(first, begins, target[entry] * m + cell)
+    inside = step.summed(now)
     right = per_row(step.rows[entry[mine]], first[mine], m * m)
     spent, sensors = (
         policy.spent(step.n, each)[np.arange(m * m) % m] for each in (world.paid, np.ones(m))
     )
-    length = per_row(step.before, mass, m * m)
-    totals = [
-        world.reward * right - spent * inside,
-        inside,
-        right,
-        sensors * inside,
-        0.0 * inside,
-        length,
-    ]
+    reward, length = world.reward * right - spent * inside, per_row(step.before, mass, m * m)
+    totals = [reward, inside, right, sensors * inside, 0.0 * inside, length]
     seen = own < count
     silent = (1.0 - false_alarm) ** (count - seen) * np.where(seen, missed, 1.0)
     return Passed(located, np.stack(totals, axis=1)), now * silent

@@ -124,13 +124,12 @@ class Renewal:
 
     def passes(self, acts: Iterable[Act]) -> list[Passed]:
         """The steps of all events under a policy, with their rewards alone."""
-        task, count, found = self.task, self.count, []
+        task, found = self.task, []
         mass = np.ones(self.normal)
         for step, (report, spent) in zip(self.steps, acts, strict=False):
-            now, mass = passed(task, step, mass, report, spent, None, count)
+            now, mass = passed(task, step, mass, report, spent, None)
             found.append(now)
-        last = passed_last(task, self.motion, self.steps[-1], mass, count, figures=False)
-        return [*found, last]
+        return [*found, passed_last(task, self.motion, self.steps[-1], mass, figures=False)]
 
     def acts(self, sets: Sequence[AnyArray]) -> Iterator[Act]:
         """Reports and prices of `sets`, or of sensors that are on with such probabilities."""

@@ -92,21 +92,20 @@ def follow(task: Task, motion: Motion, policy: PolicyTable) -> tuple[Events, Ite
 
 
 def _steps(task: Task, motion: Motion, events: Events, policy: SetTable) -> Iterator[Passed]:
-    walk, count = Walk(task, motion, events), len(events.codes)
-    key = events.key
-    mass = np.ones(count - events.forced)
+    walk, key = Walk(task, motion, events), events.key
+    mass = np.ones(len(events.codes) - events.forced)
     for n in range(task.num_choices):
         step = walk.move()
         report = policy.reports(n, key[step.rows], motion.cell[step.states])
         spent, sensors = (
             policy.spent(n, each)[key] for each in (task.paid, task.available.astype(np.float64))
         )
-        found, mass = passed(task, step, mass, report, spent, sensors, count)
+        found, mass = passed(task, step, mass, report, spent, sensors)
         yield found
         # Kept while the next one is made, it would be a tenth of the memory at a million cells.
         del found
         walk.keep(report < 1.0)
-    yield passed_last(task, motion, walk.move(), mass, count)
+    yield passed_last(task, motion, walk.move(), mass)
 
 
 def truncated_value(world: World, policy: PolicyTable, max_steps: int) -> Evaluation:

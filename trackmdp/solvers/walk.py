@@ -93,6 +93,7 @@ class Step:
         stay: `[E_before]`, probability of still being in the grid after the move.
         goes_on: `[E_before]`, whether there is a next step at all; None: everywhere (a recording may stop).
         begun: events that begin here, the last entries before the move.
+        count: B, of all events.
     """
 
     n: int
@@ -105,11 +106,29 @@ class Step:
     stay: Array
     goes_on: BoolArray | None
     begun: int
+    count: int
 
     @cached_property
     def back(self) -> sparse.csc_array:
         """`[E, E_before]`, the moves the other way round."""
         return self.moves.T
+
+    @cached_property
+    def pointer(self) -> IndexArray:
+        """`[B + 1]`, where the entries of each event begin, and where the last ones end."""
+        return row_pointer(self.rows, self.count)
+
+    def summed(self, values: Array) -> Array:
+        """`[B]` sums of `values` `[E]` over the entries of each event."""
+        # As a product with ones it takes a fourth of the time of counting with weights: entries are in order.
+        shape = (self.count, self._width)
+        entries = sparse.csr_array((values, self.states, self.pointer), shape=shape)
+        found: Array = entries @ np.ones(self._width)
+        return found
+
+    @cached_property
+    def _width(self) -> int:
+        return int(self.states.max(initial=0)) + 1
 
 
 class Walk:
@@ -194,6 +213,7 @@ class Walk:
             motion.stay[self._states],
             None if stops is None else ~stops,
             begun,
+            len(self._events.codes),
         )
 
     def _after(
@@ -337,7 +357,6 @@ def passed(
     report: npt.NDArray[np.floating] | float,
     spent: Array | float,
     sensors: Array | float | None,
-    count: int,
 ) -> tuple[Passed, Array]:
     """Carry undetected mass through a step.
 
@@ -348,14 +367,13 @@ def passed(
         report: `[E]`, probability of a report there.
         spent: `[B]`, price of the sensors on, or D for the safe action.
         sensors: `[B]`, number of sensors on, or 0 for the safe action; None: of all figures only the reward is wanted.
-        count: B.
 
     Returns:
         The step of all events, and the mass `[E]` that is left undetected.
     """
     now = step.back @ mass
     found = now * report
-    inside, located = per_row(step.rows, now, count), per_row(step.rows, found, count)
+    inside, located = step.summed(now), step.summed(found)
     # Sensors are paid while the target is in the grid, whether or not it is where they look.
     figures = [task.reward * located - spent * inside]
     if sensors is not None:
@@ -363,28 +381,34 @@ def passed(
         nothing, forced = 0.0 * inside, step.n == task.num_choices
         figures += [inside, located]
         figures += [nothing, inside] if forced else [sensors * inside, nothing]
-        figures.append(per_row(step.before, goes_on, count))
-    onward = transition(found, step.rows, step.following, count)
+        figures.append(per_row(step.before, goes_on, step.count))
+    onward = transition(found, step.pointer, step.following)
     if step.missed is not None:
-        onward = onward + transition(now - found, step.rows, step.missed, count)
+        onward = onward + transition(now - found, step.pointer, step.missed)
     # Figure by figure in memory: put together, and summed over steps, five times as fast as event by event.
     return Passed(onward, np.array(figures).T), now - found
 
 
 def passed_last(
-    task: Task, motion: Motion, step: Step, mass: Array, count: int, *, figures: bool = True
+    task: Task, motion: Motion, step: Step, mass: Array, *, figures: bool = True
 ) -> Passed:
     """The safe action after the free choices, which leave `mass` `[E_before - begun]` undetected; see `passed`."""
     mass = np.concatenate([mass, np.ones(step.begun)])
     report = 1.0 if task.safe else task.safe_detection[motion.cell[step.states]]
     sensors = 0.0 if figures else None
-    return passed(task, step, mass, report, task.safe_cost, sensors, count)[0]
+    return passed(task, step, mass, report, task.safe_cost, sensors)[0]
 
 
-def transition(value: Array, rows: IndexArray, columns: IndexArray, count: int) -> sparse.csr_array:
-    """`[B, B]` of entries in order of their rows; those of 0 are left out."""
-    some = value > 0
-    pointer = np.zeros(count + 1, dtype=_width(len(value)))
-    np.cumsum(np.bincount(rows[some], minlength=count), out=pointer[1:])
-    columns = columns[some].astype(pointer.dtype, copy=False)
-    return sparse.csr_array((value[some], columns, pointer), shape=(count, count))
+def row_pointer(rows: IndexArray, count: int) -> IndexArray:
+    """`[count + 1]`, where the entries of each row begin, of `rows` `[E]` in order: of 0 0 2 they are 0 2 2 3."""
+    return np.searchsorted(rows, np.arange(count + 1)).astype(_width(len(rows)))
+
+
+def transition(value: Array, pointer: IndexArray, columns: IndexArray) -> sparse.csr_array:
+    """`[B, B]` of entries `[E]` in order of their rows, which begin at `pointer`; those of 0 are left out."""
+    count = len(pointer) - 1
+    some = np.flatnonzero(value > 0)
+    if len(some) < len(value):
+        value, columns, pointer = value[some], columns[some], np.searchsorted(some, pointer)
+    parts = (each.astype(_width(len(value)), copy=False) for each in (columns, pointer))
+    return sparse.csr_array((value, *parts), shape=(count, count))
