@@ -66,7 +66,9 @@ def test_the_replay_buffer_takes_what_was_estimated(
         f"algo.prioritized.enabled={prioritized}",
     )
     words += (f"grid.window={'null' if window is None else window}",)
-    cfg = train_config(*words, "algo.batch_size=64", "collector.frames_per_batch=256")
+    cfg = train_config(
+        *words, "algo.batch_size=64", "algo.envs=16", "collector.frames_per_batch=256"
+    )
     assert isinstance(cfg.algo, DqnConfig)
     learner = DQN(world.task, cfg.algo, iterations=1, seed=0, device=CPU)
     learner.step(collect(world, learner.policy, 16, 4))
@@ -78,7 +80,9 @@ def test_the_replay_buffer_takes_what_was_estimated(
 def test_the_replay_buffer_of_several_targets_takes_what_was_estimated() -> None:
     group = Group([small_world()] * 3)
     words = ("targets.count=3", "algo=dqn", "algo.buffer_size=3000", "algo.updates=1")
-    cfg = train_config(*words, "algo.batch_size=64", "collector.frames_per_batch=256")
+    cfg = train_config(
+        *words, "algo.batch_size=64", "algo.envs=16", "collector.frames_per_batch=256"
+    )
     assert isinstance(cfg.algo, DqnConfig)
     learner = DQN(group.task, cfg.algo, iterations=1, seed=0, device=CPU, targets=group.targets)
     learner.step(collect(group, learner.policy, 16, 4))
