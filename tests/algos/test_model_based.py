@@ -137,6 +137,7 @@ def test_it_keeps_to_a_budget_also_while_learning(budget: int) -> None:
     assert regret_per_step(best.lower, found) < 0.01
 
 
+@pytest.mark.slow
 def test_plans_on_paths_keep_to_a_budget() -> None:
     world = headings(memory="displacement").but(budget=1)
     learner, rows = learn(world, 3, "algo.prior=1", envs=16)
@@ -144,6 +145,7 @@ def test_plans_on_paths_keep_to_a_budget() -> None:
     assert rows[-1]["sensors_per_frame"] < 1.0
 
 
+@pytest.mark.slow
 def test_with_a_budget_and_no_algorithm_named(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -299,6 +301,7 @@ def test_a_run_is_valued_loaded_exported_and_resumed(here: Path) -> None:
     assert table(torch.tensor([16]), torch.tensor([0])).nonzero().tolist() == [[0, 2]]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("little_search")
 def test_a_hidden_heading_is_solved_and_learned(here: Path) -> None:
     """By the command line: the learned policy is no better than the solved one, and valued exactly."""

@@ -69,7 +69,8 @@ class Effort(NamedTuple):
 
 
 WHOLE, SHORT = Effort(5, 6, 0, 1.0, 20), Effort(4, 4, 2, 0.55, 5)
-"""Of `solve`; and for a motion that is estimated: half the time, for .0005 a step less at most."""
+"""Of `solve`; and for a motion that is estimated: with nine velocities what it found was as good on average, in two
+fifths of the time."""
 
 
 def solve(
