@@ -86,7 +86,7 @@ def test_speed_has_a_row_for_every_policy_algorithm_and_kind_of_work() -> None:
     assert [row["what"] for row in measure("log", *short)] == ["record", "write", "read"] * 2
     assert list(words.defaults(train.rows)["algos"]) == ALGORITHMS
     # `hindsight` collects first and learns afterwards, and is measured to its end.
-    whole, cut = measure("train", "grid.size=3", "seconds=4", "algos=[hindsight,dqn]")
+    whole, cut = measure("train", "grid.size=3", "seconds=10", "algos=[hindsight,dqn]")
     assert (whole["whole"], cut["whole"]) == (True, False)
 
 
