@@ -63,7 +63,8 @@ def test_what_exchange_has_settled_is_not_searched_again(monkeypatch: pytest.Mon
     """But where some plans were left out, or its rounds ended, it goes on."""
     world = make_world("drift", size=5, t_max=1, cost=0.3, persistence=0.5)
     start = Found(renewal := Renewal(world, world.motion), search.clocked_sets(renewal))
-    one, left = exchange.exchanged(start, rounds=1), exchange.exchanged(start, go_on=lambda: False)
+    one = exchange.exchanged(start, rounds=1)
+    left = exchange.exchanged(search.ascended(start), go_on=lambda: False)
     found = exchange.exchanged(start)
     assert (one.settled, left.settled, found.settled) == (False, False, True)
     monkeypatch.setattr(exchange, "exchange", lambda *_: pytest.fail("searched again"))

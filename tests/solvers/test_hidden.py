@@ -87,7 +87,11 @@ def test_what_is_found_is_no_worse_than_the_start(monkeypatch: pytest.MonkeyPatc
         monkeypatch.setattr(hidden, limit, 0)
     least, kept, again = (
         evaluate(world, policy).aihtr
-        for policy in (hidden.best_found(world), best, hidden.solve(world, start=best).table)
+        for policy in (
+            hidden.best_found(world, hidden.WHOLE),
+            best,
+            hidden.solve(world, start=best).table,
+        )
     )
     assert least < kept <= again + 1e-9
 
@@ -95,7 +99,7 @@ def test_what_is_found_is_no_worse_than_the_start(monkeypatch: pytest.MonkeyPatc
 def test_a_child_has_the_plans_of_two(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before exchange, about half of the keys' plans are those of each; the worst policy leaves the pool."""
     world = headings(3, 0.7, cost=0.12, memory="displacement")
-    search, begun = hidden.Search(world), list[Found]()
+    search, begun = hidden.Search(world, hidden.WHOLE), list[Found]()
     renewal, rng = search.renewal, np.random.default_rng(0)
     every, none = ([np.full(len(c.rows), on) for c in renewal.choices] for on in (True, False))
     better = exchange.exchanged(Found(renewal, none))
@@ -106,7 +110,7 @@ def test_a_child_has_the_plans_of_two(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(share) == {0.0, 1.0}
     assert 0.3 < np.mean(share) < 0.7
     assert [each.aihtr for each in pool][-1] == better.aihtr
-    again = hidden.Search(world).crossed(pool, 3, rng)  # it is known
+    again = hidden.Search(world, hidden.WHOLE).crossed(pool, 3, rng)  # it is known
     assert sum(each is better for each in again) == 1
 
 
@@ -115,7 +119,7 @@ def test_a_child_takes_the_place_of_the_parent_that_it_is_like(
 ) -> None:
     """In the first half; then that of the policy of the least worth."""
     world = headings(3, 0.7, cost=0.12, memory="displacement")
-    renewal = hidden.Search(world).renewal
+    renewal = hidden.Search(world, hidden.WHOLE).renewal
     low, middle, child = (
         Found(renewal, [np.arange(len(choice.rows)) % 4 < on for choice in renewal.choices])
         for on in (0, 1, 3)
@@ -123,7 +127,9 @@ def test_a_child_takes_the_place_of_the_parent_that_it_is_like(
     assert low.aihtr < middle.aihtr < child.aihtr
     monkeypatch.setattr(hidden, "exchanged", lambda *a, **_: child)
     for count, stays in ((2, low), (1, middle)):
-        pool = hidden.Search(world).crossed([low, middle], count, np.random.default_rng(0))
+        pool = hidden.Search(world, hidden.WHOLE).crossed(
+            [low, middle], count, np.random.default_rng(0)
+        )
         assert {id(each) for each in pool} == {id(stays), id(child)}
 
 
@@ -133,7 +139,7 @@ def test_no_sets_are_searched_twice_and_a_search_that_finds_nothing_new_ends(
 ) -> None:
     """Of nine keys' plans from two policies there are 512 mixtures; of 300 draws some 230 differ."""
     world, begun = headings(3, 0.7, cost=0.12), list[bytes]()
-    search = hidden.Search(world)
+    search = hidden.Search(world, hidden.WHOLE)
     renewal = search.renewal
     every, none = (
         Found(renewal, [np.full(len(c.rows), on) for c in renewal.choices]) for on in (True, False)

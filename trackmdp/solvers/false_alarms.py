@@ -16,6 +16,7 @@ from trackmdp.arrays.entries import per_row, ranks
 from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
+from trackmdp.recordings.tracks import ends_of
 from trackmdp.solvers.evaluation import Evaluation, pooled
 from trackmdp.solvers.linear import RenewalSystem
 from trackmdp.solvers.walk import (
@@ -25,7 +26,6 @@ from trackmdp.solvers.walk import (
     Walk,
     all_events,
     passed_last,
-    row_pointer,
     transition,
 )
 from trackmdp.world.model import World
@@ -133,7 +133,7 @@ def _reports(
     missed, earlier = 1.0 - world.detection[target], own[entry] < place
     quiet = (1.0 - false_alarm) ** (place - earlier) * np.where(earlier, missed[entry], 1.0)
     first = quiet * np.where(mine, world.detection[target[entry]], false_alarm) * now[entry]
-    begins = row_pointer(step.rows[entry], m * m)
+    begins = ends_of(np.bincount(step.rows[entry], minlength=m * m))
     located = transition(first, begins, target[entry] * m + cell)
     inside = step.summed(now)
     right = per_row(step.rows[entry[mine]], first[mine], m * m)

@@ -40,8 +40,8 @@ ones."""
 _MOST_CROSSED, _MOST_AT_ONCE = 800, 200
 """Crossed policies at most, and those of one search, which more do not improve. On three by three cells crossing gains
 up to .003 a step."""
-_LEAST_ROUNDS = 2
-"""Of exchange, where sensors share cells."""
+_SHARED_ROUNDS = 2
+"""Of exchange, where sensors share cells, whatever the effort."""
 _OLD, _ALIKE = 40, 1e-6
 """A search ends after so many policies in a row that were found before, up to this relative difference."""
 
@@ -103,7 +103,7 @@ def solve(
         memory=memory,
     )
     budget, interrupted = Budget(nodes, time_limit), best.interrupted
-    search = Search(world, _watching(on_progress, budget, best, began))
+    search = Search(world, WHOLE, _watching(on_progress, budget, best, began))
     try:
         if not interrupted:
             search.run(start=start)
@@ -134,9 +134,9 @@ def _watching(
     return watch
 
 
-def best_found(world: World, effort: Effort | None = None) -> PolicyTable:
-    """The policy of `solve`, without its bound, or one found with less effort."""
-    search = Search(world, effort=effort)
+def best_found(world: World, effort: Effort) -> PolicyTable:
+    """The policy of `solve`, without its bound; with less effort one that may be worth less."""
+    search = Search(world, effort)
     search.run()
     return search.best.table
 
@@ -146,19 +146,17 @@ class Search:
 
     Args:
         world: with hidden modes.
+        effort: how far to search.
         watch: takes the best policy so far and the share of the work that is done; whether to go on.
-        effort: how far to search; None: `WHOLE`.
 
     Attributes:
         best: the best policy so far; at first the one that homotopies begin from.
     """
 
-    def __init__(
-        self, world: World, watch: Watch = lambda *_: True, effort: Effort | None = None
-    ) -> None:
+    def __init__(self, world: World, effort: Effort, watch: Watch = lambda *_: True) -> None:
         self.world, self.renewal = world, Renewal(world, world.motion)
         self.best = self._first = Found(self.renewal, clocked_sets(self.renewal))
-        self._watch, self._done, self._most, self._effort = watch, 0, 1, effort or WHOLE
+        self._watch, self._done, self._most, self._effort = watch, 0, 1, effort
         # Sets after exchange, by those before: many searches begin from the same ones.
         self._ends: dict[bytes, list[AnyArray]] = {}
 
@@ -188,7 +186,7 @@ class Search:
         if mark in self._ends:
             found = Found(self.renewal, self._ends[mark], policy)
         else:
-            rounds = max(self._effort.rounds // self._slower, _LEAST_ROUNDS)
+            rounds = self._effort.rounds if self._slower == 1 else _SHARED_ROUNDS
             found = exchanged(policy, go_on=self._goes_on, rounds=rounds, exact=False)
             self._ends[mark] = self._ends[_bytes(found.sets)] = found.sets
         self._done += 1

@@ -122,7 +122,7 @@ def unroll(
     for n in range(world.num_choices):
         step = walk.move()
         before, now = per_row(step.before, mass, world.num_cells), mass @ step.moves
-        inside = per_row(step.rows, now, world.num_cells)
+        inside = step.summed(now)
         # Joint with the misses, not conditioned on them.
         seen = Prediction(n, step.rows, step.states, now, before, inside)
         gain, prices, charge = rule(seen)

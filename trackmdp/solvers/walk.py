@@ -28,6 +28,7 @@ from trackmdp.arrays.entries import per_row
 from trackmdp.arrays.types import Array, BoolArray, IndexArray, Indices
 from trackmdp.memory.keys import KeySpace
 from trackmdp.motion.chain import Motion
+from trackmdp.recordings.tracks import ends_of
 from trackmdp.sensing.task import Task
 
 
@@ -116,7 +117,8 @@ class Step:
     @cached_property
     def pointer(self) -> IndexArray:
         """`[B + 1]`, where the entries of each event begin, and where the last ones end."""
-        return row_pointer(self.rows, self.count)
+        ends = ends_of(np.bincount(self.rows, minlength=self.count))
+        return ends.astype(_width(len(self.rows)))
 
     def summed(self, values: Array) -> Array:
         """`[B]` sums of `values` `[E]` over the entries of each event."""
@@ -397,11 +399,6 @@ def passed_last(
     report = 1.0 if task.safe else task.safe_detection[motion.cell[step.states]]
     sensors = 0.0 if figures else None
     return passed(task, step, mass, report, task.safe_cost, sensors)[0]
-
-
-def row_pointer(rows: IndexArray, count: int) -> IndexArray:
-    """`[count + 1]`, where the entries of each row begin, of `rows` `[E]` in order: of 0 0 2 they are 0 2 2 3."""
-    return np.searchsorted(rows, np.arange(count + 1)).astype(_width(len(rows)))
 
 
 def transition(value: Array, pointer: IndexArray, columns: IndexArray) -> sparse.csr_array:

@@ -14,6 +14,7 @@ from trackmdp.algos.estimates.last_moves import (
     displacements,
     heading_after,
     headings,
+    shift,
 )
 from trackmdp.recordings.tracks import Tracks
 
@@ -46,6 +47,14 @@ def test_codes_are_counted(seen: list[int], wanted: list[int], many: bool) -> No
         counts = hidden_cells._Counts.of(np.array(seen))
     assert (counts.codes is not None) == many
     assert counts.looked_up(np.array(wanted)).tolist() == [seen.count(each) for each in wanted]
+
+
+def test_a_shift_has_a_number() -> None:
+    """On 3 x 4 cells 9 for each row down and 1 for each column to the right: from 5 to 10, to 2, to 4 and to 8."""
+    task = tm.make_world("random_walk", size=(3, 4))
+    ends = np.array([10, 2, 4, 8])
+    assert shift(task, np.array([5]), ends).tolist() == [9 + 1, -9 + 1, -1, 9 - 1]
+    assert shift(task, np.array([[5], [6]]), ends).shape == (2, 4)
 
 
 def test_displacements_are_those_seen() -> None:
