@@ -29,8 +29,8 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture
 def little_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where modes are hidden, one start and no crossing: for tests of what is made of a policy, however good it is."""
-    little = hidden.WHOLE._replace(led=1, annealed=0, crossed=0.0)
+    """Where modes are hidden, one start, two rounds and no crossing: for tests of what is made of a policy."""
+    little = hidden.WHOLE._replace(led=1, annealed=0, crossed=0.0, rounds=2)
     for effort in ("WHOLE", "SHORT"):
         monkeypatch.setattr(hidden, effort, little)
 

@@ -127,12 +127,12 @@ def test_it_keeps_to_a_budget_also_while_learning(budget: int) -> None:
     """No sensor is on in the first batch: the moves are inferred from where the safe action located the target."""
     world, most = small_world(3).but(budget=budget), []
     learner = algorithm("model_based", world, f"cost.budget={budget}")
-    learner.iterations = 20
-    for seed in range(20):
+    learner.iterations = 10
+    for seed in range(10):
         batch = collect(world, learner.policy, 512, 20, seed=seed)
         most.append(int(batch["action"].sum(-1).max()))
         learner.step(batch)
-    assert most == [0] + [budget] * 19
+    assert most == [0] + [budget] * 9
     best, found = optimal.solve(world), evaluate(world, learner.actor)
     assert regret_per_step(best.lower, found) < 0.01
 
@@ -179,14 +179,14 @@ def test_a_resumed_learner_goes_on_as_the_first(sensing: str, hidden: bool, tmp_
     world = headings(memory="displacement").but(detection=0.9) if hidden else small_world(3)
     words = (f"algo.sensing={sensing}", *(["algo.warm_up=0"] if sensing == "chosen" else []))
     first = algorithm("model_based", world, *words)
-    first.iterations = 4
-    for seed in range(3):
-        first.step(collect(world, first.policy, 64, 20, seed=seed))
+    first.iterations = 3
+    for seed in range(2):
+        first.step(collect(world, first.policy, 32, 20, seed=seed))
     torch.save(first.state_dict(), tmp_path / "state.pt")
     second = algorithm("model_based", world, *words)
-    second.iterations = 4
+    second.iterations = 3
     second.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
-    batch = collect(world, first.policy, 64, 20, seed=7)
+    batch = collect(world, first.policy, 32, 20, seed=7)
     assert str(first.step(batch.clone())) == str(second.step(batch))  # nan is no equal of nan
     assert (first.actor.dense() == second.actor.dense()).all()
 
