@@ -103,7 +103,7 @@ def test_it_comes_near_the_optimum_with_every_kind_of_sensing(more: dict[str, ob
 
 
 @pytest.mark.usefixtures("little_search")
-@pytest.mark.parametrize("detection", [1.0, 0.8])
+@pytest.mark.parametrize("detection", [1.0, pytest.param(0.8, marks=pytest.mark.slow)])
 def test_a_hidden_mode_is_learned_by_paths(detection: float) -> None:
     """Better than any plan of pooled moves, also where some cells of the paths are unknown."""
     world = headings(memory="displacement").but(detection=detection)

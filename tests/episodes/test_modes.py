@@ -190,8 +190,8 @@ def test_a_run_is_evaluated_and_its_episodes_logged(tmp_path: Path) -> None:
     """What training logged, and what `evaluate run=` says: the run's own figures, and episodes that replay."""
     words = [
         "algo=model_based",
-        "algo.total_frames=4000",
-        "collector.frames_per_batch=4000",
+        "algo.total_frames=1000",
+        "collector.frames_per_batch=1000",
         "log=[mcap]",
         "quiet=true",
     ]

@@ -247,7 +247,7 @@ def check_keys(world: World) -> None:
     assert found.lower == pytest.approx(best, rel=1e-8, abs=1e-8)
 
 
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(problems(**(TINY | HIDDEN), memories=("cell", "displacement")))
 def test_solving_finds_the_best_plans_of_keys_where_modes_are_hidden(world: World) -> None:
     check_keys(world)
