@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import trackmdp as tm
 from tests.helpers import train_config
 from tests.training.runs import BUDGET, QUICK, rows, train
 from trackmdp.app.commands.train import run
 from trackmdp.config import CheckpointConfig
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.training.callbacks import Position
+from trackmdp.training.callbacks import Callback, Position, Training
 from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.training.state import Checkpoints
 from trackmdp.world.make import build_world
@@ -70,6 +72,37 @@ def test_rewards_are_logged_as_the_world_pays_them(tmp_path: Path) -> None:
         train(tmp_path / scale, f"algo.reward_scale={scale}", "collector.total_frames=256")
     first, other = (rows(tmp_path / scale)[0]["reward_per_frame"] for scale in ("0.1", "1"))
     assert first == other != "0.0"
+
+
+class _Batches(Callback):
+    """Keeps all batches."""
+
+    def __init__(self) -> None:
+        self.kept: list[Any] = []
+
+    def on_batch(self, trainer: Training, batch: Any) -> None:  # noqa: ARG002
+        self.kept.append(batch.clone())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("collector", "shape"), [("single", (4, 8)), ("multi_sync", (8, 4)), ("multi_async", (4, 8))]
+)
+def test_a_batch_is_rows_by_time_from_every_collector(
+    collector: str, shape: tuple[int, int]
+) -> None:
+    """Sums over n steps go along the second dimension: there each step begins where the one before ended."""
+    seen = _Batches()
+    more = {"collector": collector, "collector.envs": 4, "evaluation.every": 9}
+    world = tm.make_world(size=3)
+    budget = {"total_frames": 64, "frames_per_batch": 32, "hidden": 16, "n_step": 3}
+    tm.train(world, "dqn", callbacks=[seen], **budget, **more, **{"optimal.enabled": False})
+    for batch in seen.kept:
+        assert batch.shape == shape
+        before, after = batch["next"][:, :-1], batch[:, 1:]
+        goes_on = ~before["done"].squeeze(-1)
+        assert goes_on.any()
+        assert (before["last_cell"] == after["last_cell"])[goes_on].all()
 
 
 def test_a_budget_is_made_up_to_whole_batches(tmp_path: Path) -> None:

@@ -158,8 +158,7 @@ class SensedPaths:
         return sum(len(part.start) for part in self._parts)
 
     def extend(self, batch: TensorDictBase) -> None:
-        """Add a collected batch `[B, time]` or `[workers, B, time]`."""
-        batch = batch.reshape(-1, batch.shape[-1])
+        """Add a collected batch `[B, time]`."""
         paths = observed_paths(batch, self._task, last=True)
         done = batch["next", "done"].squeeze(-1).cpu().numpy().astype(np.int64)
         row, time = (part.cpu().numpy() for part in path_ends(batch).nonzero(as_tuple=True))

@@ -134,7 +134,7 @@ class InferredMoves(MoveBuffer):
 
     def extend(self, batch: TensorDictBase) -> None:
         """Add the paths that end in a collected batch `[B, time]`, with any sensors on."""
-        self._estimate.add(observed_paths(batch.reshape(-1, batch.shape[-1]), self._task))
+        self._estimate.add(observed_paths(batch, self._task))
         self._index = None
 
     def moves(self) -> tuple[Tensor, Tensor]:

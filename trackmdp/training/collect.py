@@ -113,8 +113,9 @@ def not_started(cfg: WorkersConfig, error: Exception) -> RunError:
     return RunError(f"collector={cfg.name}: a worker did not start ({message_of(error)})")
 
 
-multi_sync = partial(_in_workers, MultiSyncCollector)
-"""Every batch is collected by all of the workers."""
+# By default the batches of the workers are stacked, `[workers, B, time]`, which a learner would take for `[B, time]`.
+multi_sync = partial(_in_workers, partial(MultiSyncCollector, cat_results=0, use_buffers=True))
+"""Every batch is collected by all of the workers: `[B, time]`, their rows one after the other."""
 multi_async = partial(_in_workers, MultiAsyncCollector)
 """Every batch is collected by the worker that has it ready."""
 
