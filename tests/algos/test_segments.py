@@ -97,14 +97,13 @@ def test_segments_of_keys_are_those_of_the_environment(memory: str) -> None:
     assert len({first for first, *_ in seen}) > 40
 
 
-def test_rows_of_workers_are_rows() -> None:
-    """Collectors with worker processes stack their batches."""
+def test_rows_go_on_in_the_next_batch() -> None:
     batch = collect(SETTING, Policy.all_on(SETTING), 16, 40)
-    one, stacked = buffer(), buffer()
+    one, parted = buffer(), buffer()
     one.extend(batch)
     for part in batch.split(8, dim=1):
-        stacked.extend(torch.stack([part[:8], part[8:]]))
-    assert segments(stacked) == segments(one)
+        parted.extend(part)
+    assert segments(parted) == segments(one)
 
 
 def test_rows_that_are_others_are_not_joined() -> None:

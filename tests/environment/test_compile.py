@@ -15,8 +15,10 @@ from tensordict.nn import TensorDictModule
 
 from tests.helpers import limited, small_world
 from tests.tracks import by_hand, recorded
+from trackmdp.environment import draws
 from trackmdp.environment.env import TrackEnv
 from trackmdp.motion.modes import heading_kernel
+from trackmdp.seeding import generator
 from trackmdp.world.model import World
 
 TRACKS = ([0, 1, 2], [3, 4, 5, 8], [7, 4, 1, 0])
@@ -115,6 +117,18 @@ def test_every_tensor_is_made_on_the_environments_device(name: str) -> None:
             after, rows = env.step_and_maybe_reset(rows.set("action", frame["action"]))
             assert (after == frame).all()
         env.restore(env.snapshot())
+
+
+@pytest.mark.parametrize("name", ["world", "limited"])
+def test_all_of_it_moves_to_another_device(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """To `meta`, which holds no data: tensors of two devices in one operation are an error there, as on a GPU."""
+    # No generator lives there.
+    monkeypatch.setattr(draws, "generator", lambda seed, *names, device: generator(seed, *names))
+    env = pair(name)[0].to("meta")
+    off = TensorDict({"action": env.action_spec.zero()}, env.batch_size)
+    carried = env.step_and_maybe_reset(off.clone())[1]
+    parts = (env.step(off)["next"], carried, env.reset(), env.snapshot()["rows"])
+    assert {each.device.type for part in parts for each in part.values()} == {"meta"}
 
 
 @pytest.mark.slow

@@ -80,7 +80,7 @@ class _Batches(Callback):
     def __init__(self) -> None:
         self.kept: list[Any] = []
 
-    def on_batch(self, trainer: Training, batch: Any) -> None:  # noqa: ARG002
+    def on_batch(self, trainer: Training, batch: Any) -> None:
         self.kept.append(batch.clone())
 
 

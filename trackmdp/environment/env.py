@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import operator
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -99,20 +100,34 @@ class TrackEnv(EnvBase):
             device=torch.device(device), batch_size=_shape(batch_size), allow_done_after_reset=True
         )
         task: Task = world.single
+        self._world = world
         self.num_envs, self.max_steps = self.batch_size.numel(), task.max_steps
         self.num_cells, self.num_sensors = task.num_cells, task.num_sensors
         self.t_max, self._grid, self._stream = task.t_max, task.size, stream
         self._budget, self._targets = task.budget, (len(world),) if isinstance(world, Group) else ()
+        self._action_shape = (*self.batch_size, self.num_sensors)
+        self._make_tracking(seed)
+        self._make_specs(task)
+
+    def _make_tracking(self, seed: int) -> None:
+        """The targets, before their first reset, on the environment's device."""
+        world, count, device = self._world, self.num_envs, self.device
         self._tracking: Tracking | GroupTracking
         if isinstance(world, Group):
-            self._tracking = GroupTracking(world, self.num_envs, self.device)
+            self._tracking = GroupTracking(world, count, device)
         else:
-            self._tracking = Tracking(world, self.num_envs, self.device)
-        none = (len(FLAGS), self.num_envs, 1)
-        self._none = torch.zeros(none, dtype=torch.bool, device=self.device)
-        self._action_shape = (*self.batch_size, self.num_sensors)
-        self._make_specs(task)
+            self._tracking = Tracking(world, count, device)
+        self._none = torch.zeros((len(FLAGS), count, 1), dtype=torch.bool, device=device)
         self._set_seed(seed)
+
+    def to(self, device: torch.device | str) -> Self:
+        """Move the targets as they stand; draws begin anew from the seed, as each device has generators of its own."""
+        before, state = self.device, self._tracking.state
+        super().to(device)
+        if self.device != before:
+            self._make_tracking(self._seed)
+            self._tracking.state = {key: each.to(self.device) for key, each in state.items()}
+        return self
 
     def __repr__(self) -> str:
         grid = f"{self._grid[0]} x {self._grid[1]} cells, {self.num_sensors} sensors, t_max={self.t_max}"
@@ -192,7 +207,8 @@ class TrackEnv(EnvBase):
         return drawn
 
     def _set_seed(self, seed: int | None) -> None:
-        self._tracking.seed(seed or 0, self._stream)
+        self._seed = seed or 0
+        self._tracking.seed(self._seed, self._stream)
 
     def snapshot(self) -> dict[str, dict[str, Tensor]]:
         """The state of all targets `[num_envs, ...]` and of the generators, for a checkpoint."""
