@@ -33,6 +33,13 @@ def test_a_config_folder_of_ones_own_adds_choices(
     assert (calls[0].kernel.name, calls[0].kernel.stay) == ("random_walk", 0.9)
     capsys.readouterr()
     assert "stai" in refused(capsys, "train", "--config-dir", "../mine", "kernel=typo")
+    (tmp_path / "mine/algo").mkdir()
+    (tmp_path / "mine/algo/bare.yaml").write_text("defaults: [base_ppo]\ngamma: 0.9\n")
+    words = ["train", "--config-dir", "../mine", "algo=bare"]
+    assert refused(capsys, *words) == "algo.total_frames: missing"
+    budget = [f"algo.{name}=1" for name in ("total_frames", "frames_per_batch", "envs")]
+    said = refused(capsys, *words, *budget)
+    assert "algo.learning_rate: missing, expected its start, end, begin, until" in said
 
 
 @pytest.mark.parametrize(

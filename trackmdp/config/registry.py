@@ -27,7 +27,11 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import AnyNode, DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException, UnsupportedValueType
+from omegaconf.errors import (
+    InterpolationToMissingValueError,
+    OmegaConfBaseException,
+    UnsupportedValueType,
+)
 
 from trackmdp.config.learning import MOST_FRAMES
 from trackmdp.config.options import GROUPS, ChoiceConfig, options
@@ -154,6 +158,8 @@ def resolved(values: dict[str, Any] | DictConfig) -> dict[str, Any]:
         plain: Any = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:
         # Its further lines (full_key, object_type) are about OmegaConf.
+        if isinstance(error, InterpolationToMissingValueError):
+            raise UserError(f"{message_of(error).rpartition(' ')[2]}: missing") from error
         where = f"{error.full_key}: " if isinstance(error, UnsupportedValueType) else ""
         raise UserError(f"{where}{message_of(error)}") from error
     return dict(plain)

@@ -133,7 +133,8 @@ def _built(key: str, item: Option | Node, value: Any, prefix: str) -> Any:
     if value is None and item.optional:
         return None
     if value == MISSING:
-        raise UserError(f"{prefix}{key}: missing, expected {key}=NAME")
+        needed = f"{key}=NAME" if key in GROUPS else f"its {', '.join(options(item.schema))}"
+        raise UserError(f"{prefix}{key}: missing, expected {needed}")
     if item.several and isinstance(value, Mapping):
         for name in value:
             check_choice(key, name)

@@ -65,6 +65,6 @@ class Counts:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
-        self.counts = sparse.csr_array(
-            (state["count"].numpy(), tuple(state["at"].numpy())), shape=self.counts.shape
-        )
+        # `cpu`: a checkpoint is read to the learner's device.
+        count, at = (state[name].cpu().numpy() for name in ("count", "at"))
+        self.counts = sparse.csr_array((count, tuple(at)), shape=self.counts.shape)
