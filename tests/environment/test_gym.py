@@ -18,6 +18,7 @@ from tests.tracks import by_hand, recorded
 from trackmdp.environment.env import TrackEnv
 from trackmdp.environment.render import PICTURE_LEGEND
 from trackmdp.errors import UserError
+from trackmdp.world.group import Group
 from trackmdp.world.model import World
 
 gymnasium = pytest.importorskip("gymnasium")
@@ -31,13 +32,16 @@ PROBLEMS: dict[str, Any] = {
     "limited": limited(WORLD, 6),
     "window": World(np.full((20, 20), 0.04), (4, 5), cost=0.1, t_max=1, window=1),
     "tracks": recorded(by_hand([0, 1, 2], [3, 4, 5, 8], exits=True)),
+    "group": Group([WORLD] * 2),
 }
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_it_passes_gymnasiums_checker(name: str) -> None:
-    env = gymnasium.make(ID, world=PROBLEMS[name], render_mode="rgb_array").unwrapped
-    check_env(env)
+    drawn = name != "group"  # of several targets there is no picture
+    mode = "rgb_array" if drawn else None
+    env = gymnasium.make(ID, world=PROBLEMS[name], render_mode=mode).unwrapped
+    check_env(env, skip_render_check=not drawn)
 
 
 @pytest.mark.parametrize(
@@ -67,6 +71,8 @@ def test_it_is_made_by_its_name_with_a_world_of_options(name: str) -> None:
     env.reset(seed=1)
     assert env.render().count("·") == 9  # eight cells, one in the legend
     assert str(env.action_space) == "MultiBinary(9)"
+    leaving = gymnasium.make(name, size=3, exit_probability=0.3).unwrapped.world
+    assert leaving.stay_probability == pytest.approx(np.full(9, 0.7))
 
 
 @pytest.mark.parametrize("how", ["by name", "wrapped"])
@@ -111,7 +117,7 @@ def test_a_step_by_hand() -> None:
         assert env.render().count("●") == 2  # one in the legend
 
 
-@pytest.mark.parametrize("name", ["world", "limited"])
+@pytest.mark.parametrize("name", ["world", "limited", "group"])
 def test_a_batch_is_that_of_the_environment(name: str) -> None:
     """300 steps of 8 targets: the same rewards and ends, observations after an end those of the next episode."""
     env = gymnasium.make_vec(ID, num_envs=8, world=PROBLEMS[name])
@@ -139,8 +145,9 @@ def test_a_batch_is_that_of_the_environment(name: str) -> None:
         assert np.array_equal(info.get("_final_obs", np.zeros(8, bool)), done)
         for row in np.flatnonzero(done):
             final = info["final_obs"][row]
-            assert final["steps_since_detection"] == frame["next", "steps_since_detection"][row]
-            assert (info["final_info"]["target"][row] == 9) == terminated[row]
+            misses = frame["next", "steps_since_detection"][row]
+            assert np.array_equal(final["steps_since_detection"], misses)
+            assert (info["final_info"]["target"][row] == 9).all() == terminated[row]
 
 
 def test_an_unknown_option_is_a_type_error() -> None:

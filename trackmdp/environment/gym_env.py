@@ -16,9 +16,11 @@ from gymnasium.vector.utils import batch_space
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary
 
+from trackmdp.config.compose import compose
 from trackmdp.config.options import GROUPS, options
 from trackmdp.environment.env import TrackEnv
 from trackmdp.errors import UserError
+from trackmdp.world.group import Group
 from trackmdp.world.make import make_world
 from trackmdp.world.problem import Problem
 
@@ -35,7 +37,7 @@ class _Tracked:
 
     def _make(
         self,
-        world: Problem | None,
+        world: Problem | Group | None,
         given: dict[str, Any],
         render_mode: str | None,
         shape: tuple[int, ...],
@@ -96,13 +98,13 @@ class _Tracked:
 
 
 class TrackGym(_Tracked, gymnasium.Env[Observation, npt.NDArray[np.int8]]):
-    """One target (paper, Section II); `info["target"]` is its true cell, M once it has exited.
+    """One target (paper, Section II); `info["target"]` is its true cell, M once it has exited; of a group `[K]`.
 
     An observation has the keys of `TrackEnv`, `action_history` as a `Box` of 0 and 1; an action is a `MultiBinary(K)`:
     the sensors to switch on. Stable-Baselines3 reads it with its `MultiInputPolicy`, TorchRL with `GymEnv`.
 
     Args:
-        world: the world, or recorded tracks; None to make one of `options`.
+        world: the world, recorded tracks or a group of targets; None to make one of `options`.
         render_mode: "ansi" for text, "human" to print it at each step, "rgb_array" for pixels, or None.
         options: options of `make_world`.
 
@@ -115,7 +117,11 @@ class TrackGym(_Tracked, gymnasium.Env[Observation, npt.NDArray[np.int8]]):
     metadata: dict[str, Any] = {"render_modes": list(_MODES), "render_fps": 4}  # noqa: RUF012, Gymnasium's own form
 
     def __init__(
-        self, world: Problem | None = None, *, render_mode: str | None = None, **options: Any
+        self,
+        world: Problem | Group | None = None,
+        *,
+        render_mode: str | None = None,
+        **options: Any,
     ) -> None:
         self.observation_space, self.action_space = self._make(world, options, render_mode, ())
 
@@ -131,8 +137,8 @@ class TrackGym(_Tracked, gymnasium.Env[Observation, npt.NDArray[np.int8]]):
 class TrackVector(_Tracked, VectorEnv[Observation, npt.NDArray[np.int8], npt.NDArray[Any]]):
     """A batch of targets stepped at once; an episode that ends is begun anew in the same step.
 
-    `infos["target"]` `[B]` are the true cells at the end of the step; where an episode ended, `infos["final_obs"]` is
-    its last observation, and `infos["final_info"]["target"]` the last cell.
+    `infos["target"]` `[B]`, of groups `[B, K]`, are the true cells at the end of the step; where an episode ended,
+    `infos["final_obs"]` is its last observation, and `infos["final_info"]["target"]` the last cell.
 
     Args:
         num_envs: B.
@@ -150,7 +156,7 @@ class TrackVector(_Tracked, VectorEnv[Observation, npt.NDArray[np.int8], npt.NDA
     def __init__(
         self,
         num_envs: int = 1,
-        world: Problem | None = None,
+        world: Problem | Group | None = None,
         *,
         render_mode: str | None = None,
         **options: Any,
@@ -185,15 +191,18 @@ class TrackVector(_Tracked, VectorEnv[Observation, npt.NDArray[np.int8], npt.NDA
         final = np.full(self.num_envs, None, dtype=object)
         for row in np.flatnonzero(done):
             final[row] = {key: value[row] for key, value in seen.items()}
-        info = {"target": np.where(done, self._env.target.numpy(), 0), "_target": done}
+        target = self._env.target.numpy()
+        ended = done.reshape(-1, *[1] * (target.ndim - 1))
+        info = {"target": np.where(ended, target, 0), "_target": done}
         return {"final_obs": final, "_final_obs": done, "final_info": info, "_final_info": done}
 
 
 def _space(spec: Any, batch_dims: int) -> spaces.Space[Any]:
-    """The space of one target, from a spec of the environment."""
-    if not isinstance(spec, Binary):
-        return spaces.Discrete(spec.space.n)
+    """The space of one target, or of one group of them, from a spec of the environment."""
     shape = spec.shape[batch_dims:]
+    if not isinstance(spec, Binary):
+        values = spec.space.n
+        return spaces.MultiDiscrete(np.full(shape, values)) if shape else spaces.Discrete(values)
     if len(shape) == 1:
         return spaces.MultiBinary(shape[0])
     # TorchRL 0.14.1 converts a `MultiBinary` of one dimension only.
@@ -206,8 +215,8 @@ def _check_names(given: dict[str, Any]) -> None:
     Raises:
         TypeError: an option is unknown.
     """
-    known = set(signature(make_world).parameters)
-    kernel = given.get("kernel", signature(make_world).parameters["kernel"].default)
+    known, kernel = set(signature(make_world).parameters), given.get("kernel")
+    kernel = compose("compare").kernel.name if kernel is None else kernel
     if kernel in GROUPS["kernel"]:
         known |= set(options(GROUPS["kernel"][kernel]))
     for name in sorted(set(given) - known):
