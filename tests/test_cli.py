@@ -114,7 +114,12 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         ),
         (
             "train seed=${oc.env:NONE,4}",
-            "seed: the text '4', expected an integer >= 0 (from the environment: ",
+            "seed: the text '4', expected an integer >= 0 (from the environment: "
+            '"${oc.decode:${oc.env:NAME}}")',
+        ),
+        (
+            'train seed="${oc.decode:${oc.env:NONE,-4}}"',  # in this form it is read
+            "seed=-4: expected an integer >= 0",
         ),
         ("train --seed 3", "unrecognized arguments: --seed (write seed=VALUE)"),
         (

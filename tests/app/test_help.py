@@ -163,6 +163,9 @@ def test_an_example_is_printed_by_its_name(capsys: pytest.CaptureFixture[str]) -
     [
         (["resume=auto"], "resume=auto: expected hydra.run.dir=FOLDER"),
         (["-m", "seed=0,1", "hydra.sweep.subdir=a"], "hydra.sweep.subdir=a: without effect"),
+        (["-m", "seed=0,1", "hydra.run.dir=a"], "hydra.run.dir=a: without effect, the folder of a"),
+        (["hydra.sweep.dir=a"], "hydra.sweep.dir=a: without effect on a single run, expected -m"),
+        (["hydra/launcher=joblib"], "hydra/launcher=joblib: without effect on a single run"),
     ],
 )
 def test_words_without_effect_are_refused(

@@ -35,10 +35,17 @@ from trackmdp.app.words import gathered, parsed, run_words
 from trackmdp.config import GROUPS, ROOTS
 from trackmdp.config.checks import validate
 from trackmdp.config.registry import maker
+from trackmdp.config.resume import key_of
 from trackmdp.config.tree import build_config
 from trackmdp.errors import UserError, message_of
 
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
+_OF_SWEEPS = ("hydra.sweep", "hydra.launcher")
+_OF_SINGLE_RUNS = {
+    "hydra.run.dir": "the folder of a sweep is hydra.sweep.dir",
+    "hydra.sweep.subdir": "a run's folder has the name of its options",
+}
+"""Options that a single run, and that a sweep does not read."""
 
 
 def launch(command: str, words: Sequence[str]) -> int:
@@ -60,6 +67,9 @@ def launch(command: str, words: Sequence[str]) -> int:
 
 
 def _run_once(compose: Composer) -> int:
+    for word in compose.words:
+        if key_of(word).startswith(_OF_SWEEPS):
+            raise UserError(f"{word}: without effect on a single run, expected -m beside it")
     cfg = compose(compose.words)
     # The default folder has the time in its name: no run would ever be resumed.
     if "resume=auto" in compose.words and "${now:" in str(OmegaConf.to_container(cfg.hydra.run)):
@@ -166,8 +176,8 @@ def _of_all_runs(compose: Composer) -> Any:
     """
     common = []
     for word in compose.words:
-        if word.startswith("hydra.sweep.subdir="):
-            raise UserError(f"{word}: without effect, a run's folder has the name of its options")
+        if why := _OF_SINGLE_RUNS.get(key_of(word)):
+            raise UserError(f"{word}: without effect, {why}")
         if not parsed(word).is_sweep_override():
             common.append(word)
         elif not run_words([word]):

@@ -338,7 +338,7 @@ def refuse(key: str, value: object, expected: str) -> UserError:
     number = "number" in expected or "integer" in expected
     if number and isinstance(value, str) and is_number(value):
         # `seed=4: expected an integer` would contradict itself; from the environment comes text.
-        how = "${oc.decode:${oc.env:NAME}}"
+        how = '"${oc.decode:${oc.env:NAME}}"'  # quoted: Hydra's grammar has no braces in braces
         return UserError(
             f"{key}: the text '{value}', expected {expected} (from the environment: {how})"
         )
