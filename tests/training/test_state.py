@@ -16,11 +16,13 @@ import torch
 from tests.helpers import train_config
 from tests.training.runs import BUDGET, QUICK, SMALL, assert_same_run, at_iteration, rows, train
 from tests.training.test_checkpoint import corrupted
+from trackmdp.algos.common import make_algorithm
 from trackmdp.app.cli import main
 from trackmdp.config import load_run_config, to_dict
 from trackmdp.errors import RunError, UserError
 from trackmdp.training import checkpoint
-from trackmdp.training.state import find
+from trackmdp.training.state import find, take_weights
+from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 from trackmdp.world.problem_file import PROBLEM, problem_bytes, read_problem
 
@@ -333,6 +335,22 @@ def test_weights_are_taken_where_they_fit(
     )
     assert "none of its weights has the name and shape of one of ours" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
+
+
+def test_prices_and_exploration_are_no_weights(tmp_path: Path) -> None:
+    """The first batch of the new run is explored as its own options say, and its values count in its own prices."""
+    train(tmp_path / "cheap", "cost.sensor=0.1", "collector.total_frames=512", algo="dqn")
+    given = checkpoint.load(checkpoint.newest(tmp_path / "cheap"))["algorithm"]
+    cfg = train_config(*SMALL["dqn"], *QUICK, *BUDGET)
+    learner = make_algorithm(cfg, build_world(cfg).task, CPU)
+    epsilon = learner.state_dict()["explore"]["epsilon"].clone()
+    assert epsilon != given["explore"]["epsilon"]
+    take_weights(learner, tmp_path / "cheap", CPU)
+    assert learner.state_dict()["explore"]["epsilon"] == epsilon
+    mine, theirs = learner.state_dict()["loss"], given["loss"]
+    others = {name for name, part in mine.items() if isinstance(part, torch.Tensor)}
+    others -= {name for name in others if mine[name].equal(theirs[name])}
+    assert {name.rpartition(".")[2] for name in others} == {"unit"}
 
 
 def test_a_run_without_weights_is_named_by_its_option(

@@ -25,7 +25,9 @@ from trackmdp.untrusted import decoded
 from trackmdp.world.group import Subject
 
 _EXACT = ("torch", "torchrl", "tensordict", "numpy", "scipy", "hydra-core", "trackmdp")
-_NOT_WEIGHTS = {"optimizer", "buffer", "generator"}
+_NOT_WEIGHTS = {"optimizer", "buffer", "generator", "explore", "unit"}
+"""Parts of a state that are not learned: how much is explored, and the prices in which `AdditiveQ` counts, are the new
+run's own."""
 _SAVING = 50  # seconds of training to one of saving, at least
 
 
