@@ -38,6 +38,7 @@ from tests.tracks import by_hand, recorded
 from trackmdp.environment.env import TrackEnv
 from trackmdp.environment.observation import ObservationVector
 from trackmdp.errors import UserError
+from trackmdp.world.group import Group
 from trackmdp.world.model import World
 
 OBSERVED = {"last_cell", "steps_since_detection", "action_history"}
@@ -191,6 +192,15 @@ def test_the_vector_is_the_state_in_bits() -> None:
     made = env.transform(TensorDict(state, []))["observation"]
     assert made.nonzero().squeeze(-1).tolist() == [4, 9 + 1, 12 + 0, 12 + 8]
     assert made.shape == env.observation_spec["observation"].shape == (9 + 3 + 18,)
+
+
+@pytest.mark.parametrize("how", ["in an environment", "alone"])
+def test_of_several_targets_there_is_no_vector(how: str) -> None:
+    group = Group([small_world()] * 2)
+    with pytest.raises(UserError, match=r"^ObservationVector: .*, expected a task, a world or an"):
+        if how == "alone":
+            ObservationVector(group)  # type: ignore[arg-type]
+        TransformedEnv(TrackEnv(group, 3), ObservationVector()).rollout(2)
 
 
 def test_its_picture() -> None:

@@ -12,6 +12,7 @@ from trackmdp.errors import UserError
 from trackmdp.sensing.task import Task
 
 _KEYS = ("last_cell", "steps_since_detection", "action_history")
+_OF_ONE = "expected a task, a world or an environment of one target"
 
 
 class ObservationVector(ObservationTransform):
@@ -30,7 +31,7 @@ class ObservationVector(ObservationTransform):
         out_key: name of the vector.
 
     Raises:
-        UserError: when called, without a task and without an environment.
+        UserError: there are several targets; or when called, without a task and without an environment.
     """
 
     def __init__(self, task: Task | None = None, *, out_key: str = "observation") -> None:
@@ -41,10 +42,14 @@ class ObservationVector(ObservationTransform):
 
     def fit(self, task: Task) -> None:
         """Take the numbers of cells and of values of n from a task, unless they are known."""
+        if not isinstance(task, Task):
+            raise UserError(f"ObservationVector: a {type(task).__name__}, {_OF_ONE}")
         self._sizes = self._sizes or (task.num_cells, task.t_max + 2)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """The specs of `TrackEnv` and of the vector."""
+        if "present" in observation_spec.keys():  # noqa: SIM118 (no dict)
+            raise UserError(f"ObservationVector: several targets, {_OF_ONE}")
         cell, n, history = (observation_spec[key] for key in _KEYS)
         self._sizes = (cell.space.n, n.space.n)
         width = sum(self._sizes) + history.shape[-2:].numel()
