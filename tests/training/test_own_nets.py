@@ -30,7 +30,7 @@ class Sensors(distributions.Independent):
         return (self.base_dist.logits > 0).float()
 
 
-def nets() -> dict[str, Any]:
+def nets(distribution: type[distributions.Distribution] = Sensors) -> dict[str, Any]:
     """Actor and critic on one flat observation."""
     torch.manual_seed(0)
     env = tm.TrackEnv(WORLD, 2)
@@ -38,7 +38,7 @@ def nets() -> dict[str, Any]:
     actor = ProbabilisticActor(
         TensorDictModule(MLP(size, 9, num_cells=[16, 16]), ["observation"], ["logits"]),
         in_keys=["logits"],
-        distribution_class=Sensors,
+        distribution_class=distribution,
         return_log_prob=True,
     )
     critic = ValueOperator(MLP(size, 1, num_cells=[16]), in_keys=["observation"])
@@ -69,6 +69,11 @@ def test_one_of_them_may_be_the_algorithms() -> None:
         ("a2c", {"actor": nn.Linear(3, 3)}, "actor: a Linear, expected a module that writes"),
         ("a2c", {"critic": nets()["actor"]}, "critic: a ProbabilisticActor, expected a module"),
         ("a2c", {"actor": nets()["actor"], "partition.block": 3}, "actor, critic: expected none"),
+        (
+            "ppo",
+            {"actor": nets(distributions.Bernoulli)["actor"]} | FEW,
+            "actor: action_log_prob [64, 32, 9], expected one number for a set, [64, 32]",
+        ),
     ],
 )
 def test_networks_that_do_not_fit_are_one_line(

@@ -29,6 +29,7 @@ from trackmdp.algos.common import (
     set_learning_rate,
 )
 from trackmdp.config.learning import ActorCriticConfig, PpoConfig
+from trackmdp.errors import UserError
 from trackmdp.policies.joint_nets import last_clock
 from trackmdp.policies.nets import make_actor, make_critic
 from trackmdp.seeding import generator
@@ -115,9 +116,17 @@ class OnPolicy(Checkpointed):
         The advantage is normalised at each n by itself: near the safe action returns spread wider than elsewhere. On
         forced steps that action replaces the policy's, which therefore gets no credit for them. Prices are paid on all
         other steps but the last of an episode; `price_weight` is their weight beside the advantage.
+
+        Raises:
+            UserError: an actor of one's own gives a probability of each sensor, not of the set.
         """
         if batch is None:
             raise ValueError("an on-policy algorithm learns from fresh frames only")
+        if (found := batch["action_log_prob"].shape) != batch.shape:
+            raise UserError(
+                f"actor: action_log_prob {list(found)}, expected one number for a set, {list(batch.shape)}, as of "
+                "torch.distributions.Independent(Bernoulli(logits=...), 1)"
+            )
         progress = self.iteration / self.iterations
         self.iteration += 1
         rate, entropy = self.cfg.learning_rate.at(progress), self.cfg.entropy.at(progress)
