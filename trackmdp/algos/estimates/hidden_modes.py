@@ -25,9 +25,9 @@ from trackmdp.world.model import World
 _GUESSES, _FIRST_ROUNDS, _FIRST, _REFINED = 8, 15, 40_000, 2
 """First guesses, and the rounds after which the most likely ones go on, on so many moves; and how many do. With twelve
 modes the others end up to .04 a move below them."""
-_BOTH, _ROUNDS, _MOST, _LONGEST = 20, 25, 200_000, 100
-"""Rounds after them of those that go on, and of the best one of these; and moves: with twelve modes a round takes a
-tenth of a second. All paths take a step at once, and longer ones are cut."""
+_ROUNDS, _MOST, _LONGEST = 45, 200_000, 100
+"""Rounds after them, and moves: with twelve modes a round takes a tenth of a second. All paths take a step at once, and
+longer ones are cut. After 20 rounds the likelier of two fits can be the one that ends lower."""
 _AGAIN = 15
 """Rounds from an earlier fit, which most of the paths have made."""
 _FREE, _SPARED = 10, 2e-5
@@ -82,9 +82,8 @@ def fit_modes(
     guesses = sorted(
         (_guessed(few, modes, rng) for _ in range(_GUESSES)), key=lambda guess: -guess[1]
     )
-    fits = [_after(paths, few.on(paths, moves), _BOTH, _FREE) for moves, _ in guesses[:_REFINED]]
-    best, _ = max(fits, key=lambda fit: fit[1])
-    return Fit(paths, _after(paths, best, _ROUNDS, 0)[0])
+    fits = [_after(paths, few.on(paths, moves), _ROUNDS, _FREE) for moves, _ in guesses[:_REFINED]]
+    return Fit(paths, max(fits, key=lambda fit: fit[1])[0])
 
 
 def _guessed(paths: _Paths, modes: int, rng: np.random.Generator) -> tuple[Array, float]:
