@@ -28,16 +28,17 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
 LONG = "a" * 300  # longer than a name may be
 
 
+@pytest.mark.parametrize("name", ["OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"])
 @pytest.mark.parametrize(("given", "found"), [(None, "1"), ("3", "3")])
 def test_exact_figures_do_not_depend_on_the_number_of_cores(
-    given: str | None, found: str, monkeypatch: pytest.MonkeyPatch
+    name: str, given: str | None, found: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """NumPy reads the variable when it is imported; as soon as it shares a sum out, the sum rounds differently."""
-    monkeypatch.setenv("OPENBLAS_NUM_THREADS", given or "")
+    """NumPy and torch read them when they are imported; a sum that they share out rounds differently."""
+    monkeypatch.setenv(name, given or "")
     if given is None:
-        monkeypatch.delenv("OPENBLAS_NUM_THREADS")
+        monkeypatch.delenv(name)
     assert main(["--version"]) == 0
-    assert os.environ["OPENBLAS_NUM_THREADS"] == found
+    assert os.environ[name] == found
 
 
 @pytest.mark.parametrize("group", [group for group in GROUPS if "/" not in group])

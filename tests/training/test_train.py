@@ -20,6 +20,7 @@ from trackmdp.app.commands import train as command
 from trackmdp.errors import RunError, UserError
 from trackmdp.motion.kernels import drift
 from trackmdp.policies.policy import Policy
+from trackmdp.training import run
 from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.training.evaluator import Score
 from trackmdp.training.run import load_run
@@ -275,5 +276,13 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
         train(small_world(), "a2c", folder=folder, **QUICK)
 
 
-def test_the_threads_of_a_summary_are_those_of_the_run() -> None:
-    assert train(small_world(), "a2c", threads=2, **QUICK).summary["machine"]["torch_threads"] == 2
+def test_a_run_has_its_threads_until_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last figures of several targets are those of a network, which waits long for threads nobody asked for."""
+    seen = []
+
+    def beside(*args: Any, **options: Any) -> None:
+        seen.append(torch.get_num_threads())
+
+    monkeypatch.setattr(run, "_several", beside)
+    summary = train(small_world(), "a2c", threads=2, **QUICK).summary
+    assert [*seen, summary["machine"]["torch_threads"], torch.get_num_threads()] == [2, 2, 1]

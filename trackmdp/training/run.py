@@ -117,6 +117,17 @@ def complete(trainer: Learning) -> Run:
     Raises:
         UserError, Preempted, RunError: see `trainer.Trainer.run`.
     """
+    # The number of threads is the whole process's: a caller of `train` from Python gets the former number back.
+    before = torch.get_num_threads()
+    torch.set_num_threads(trainer.config.threads)
+    try:
+        return _complete(trainer)
+    finally:
+        torch.set_num_threads(before)
+
+
+def _complete(trainer: Learning) -> Run:
+    """See `complete`."""
     began, used = time.monotonic(), time.process_time()
     rows = _Rows()
     trainer.callbacks.append(rows)
@@ -280,8 +291,7 @@ def summarize(
         "place": place.facts() if (place := trainer.problem.task.place) else None,
         "versions": {"trackmdp": __version__, "python": platform.python_version()}
         | {name: version(name) for name in _PACKAGES},
-        "machine": machine()
-        | {"torch_threads": config.threads},  # the process has its own back by now
+        "machine": machine(),
         "config_sha256": config_digest(config, trainer.folder),
     }
 

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from rich.console import Console
 from tensordict import TensorDictBase
 
@@ -95,9 +94,6 @@ class Trainer(Training):
         """
         began = time.monotonic()
         with ExitStack() as opened:
-            # The number of threads is the whole process's: a caller of `train` from Python gets the former number back.
-            opened.callback(torch.set_num_threads, torch.get_num_threads())
-            torch.set_num_threads(self.config.threads)
             self._build(opened)
             # Left last, after the callbacks' ends: a second signal must not cut off the saving that the first began.
             self._signals = opened.enter_context(Signals())
