@@ -14,8 +14,8 @@ from trackmdp.training.callbacks import Position
 from trackmdp.training.display import Display
 
 
-def shown(width: int, *, terminal: bool) -> list[str]:
-    """The lines that are printed for a run of 1,000,000 frames, collected in 4 s."""
+def shown(width: int, *, terminal: bool, frames: int = 1_000_000) -> list[str]:
+    """The lines that are printed for a run of so many frames, collected in 4 s."""
     out = io.StringIO()
     console = Console(
         width=width, file=out, force_terminal=terminal, color_system=None, soft_wrap=not terminal
@@ -27,7 +27,7 @@ def shown(width: int, *, terminal: bool) -> list[str]:
     display.on_start(trainer)
     trainer.score = SimpleNamespace(evaluation=SimpleNamespace(aihtr=-2985.0))
     trainer.position, trainer.collecting = (
-        Position(iteration=10, frames=1_000_000, seconds=50.0),
+        Position(iteration=10, frames=frames, seconds=50.0),
         4.0,
     )
     display.on_update(trainer, {})
@@ -50,3 +50,8 @@ def test_frames_per_second_are_those_of_collecting(terminal: bool) -> None:
         "1,000,000 frames 250,000/s AIHTR -2,985.00" in line
         for line in shown(160, terminal=terminal)
     )
+
+
+def test_a_run_that_collects_no_more_has_no_speed() -> None:
+    """As one resumed while it learns from its buffer alone."""
+    assert any("0 frames AIHTR -2,985.00" in line for line in shown(160, terminal=False, frames=0))

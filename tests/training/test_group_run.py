@@ -72,6 +72,17 @@ def test_a_loaded_run_acts_and_is_valued_as_it_was(tmp_path: Path) -> None:
     assert written["merge"] == "joint"
 
 
+def test_a_log_says_that_all_targets_are_simulated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Which may take minutes after `0 s left`."""
+    few = [f"algo.{name}={value}" for name, value in FEW.items()]
+    words = [*WALKS, "algo=a2c", *few, "optimal.enabled=false", "evaluation.width=0.2"]
+    assert main(["train", "grid.size=3", *words, f"hydra.run.dir={tmp_path / 'a'}"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "100 %" in lines[lines.index("simulating all targets") - 1]
+
+
 def test_the_group_is_in_the_runs_folder(tmp_path: Path) -> None:
     world = tm.make_world("random_walk", size=3, exit_probability=0.2, cost=0.1)
     other = tm.make_world("drift", size=3, exit_probability=0.3, cost=0.1)

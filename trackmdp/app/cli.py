@@ -36,9 +36,8 @@ def main(argv: list[str] | None = None) -> int:
     # Set before TorchRL and NumPy are imported, which read them then.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reports every buffer it makes
     # Shared out to more threads, by default to all cores, sums round differently: the last digits of exact figures
-    # would depend on the machine, and networks of a few rows wait for a busy core. `threads` is about torch alone.
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+    # would depend on the machine. `threads` is about torch alone.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Every process that the command starts inherits it; see `trackmdp.imports.safe_children`.
     os.environ.setdefault("PYTHONSAFEPATH", "1")
     if argv is None:

@@ -93,7 +93,7 @@ class Display(Callback):
         at, aihtr = trainer.position, trainer.score.evaluation.aihtr
         # Of the time spent collecting: learners that replay go on for long after their last frame.
         speed = (at.frames - self._first.frames) / max(trainer.collecting, 1e-9)
-        rate = f" {speed:,.0f}/s" if self._console.width >= 100 else ""
+        rate = f" {speed:,.0f}/s" if speed and self._console.width >= 100 else ""
         figures = f"{at.frames:,} frames{rate} AIHTR {aihtr:,.2f}"
         gap = trainer.evaluator.upper - aihtr
         if not math.isnan(gap):  # no upper bound is known on recorded tracks

@@ -181,7 +181,10 @@ def _several(trainer: Learning, policy: Policy, single: Solution | None) -> Seve
         return None
     group = group_of(trainer.problem, cfg.targets.count)
     rule = group_rule(group, policy, *([] if cfg.algo.joint else [cfg.targets.merge]))
-    with trainer.console.status("simulating all targets"):
+    console, text = trainer.console, "simulating all targets"
+    if not console.is_terminal:  # where no status is shown; it may take minutes
+        console.print(text)
+    with console.status(text):
         return beside(rule, cfg.optimal, width=cfg.evaluation.width, seed=cfg.seed, single=single)
 
 

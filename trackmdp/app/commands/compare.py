@@ -24,6 +24,7 @@ def run(cfg: CompareConfig, folder: Path, problem: Subject) -> float:
     The problem is the first run's; without one, `cfg`'s. Where a run learned for several targets, all policies are
     compared for as many.
     """
+    torch.set_num_threads(1)  # as in `evaluate`: networks of few rows wait long for more
     console, policies = make_console(cfg.quiet), dict[str, Any]()
     found = [trained(each, torch.device("cpu")) for each in cfg.runs or []]
     count = max((load_run_config(each).targets.count for each in cfg.runs or []), default=1)
