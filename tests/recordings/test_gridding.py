@@ -106,7 +106,7 @@ def test_a_longer_gap_cuts_a_track() -> None:
     assert cells(tracks) == [[3, 3, 4, 4], [5, 2]]  # x = 5, 8.3, 11.7, 15
     assert tracks.names.tolist() == [0, 0]
     assert tracks.exits.tolist() == [False, True]
-    assert report["cuts where no report came for 15 or the file has a break"] == 1
+    assert report["cuts where no report came for 15 s or the file has a break"] == 1
     assert made(seen((0, 0, 5, 5), (0, 15, 15, 5)), exits=False)[0].exits.tolist() == [False]
 
 
@@ -144,7 +144,7 @@ def test_short_tracks_are_dropped_and_all_is_counted() -> None:
         "targets": 3,
         "reports without a time or a position": 1,
         "reports at a time seen before": 1,
-        "cuts where no report came for 15 or the file has a break": 1,
+        "cuts where no report came for 15 s or the file has a break": 1,
         "steps": 6,
         "steps outside of the grid": 1,
         "steps in 2 tracks of fewer than 2 cells": 2,

@@ -71,11 +71,12 @@ def to_tracks(
     cells = place.cells(x, y, grid.size)
     tracks, counts = _cut(cells, begin, last, flat, grid)
     gaps = int(_breaks(flat, grid).sum()) - len(np.unique(flat.track))
+    gap = f"{grid.max_gap:g} {'frames' if positions.downwards else 's'}"
     report = {
         "reports read": positions.read,
         "targets": len(np.unique(flat.track)),
         **positions.dropped,
-        f"cuts where no report came for {grid.max_gap:g} or the file has a break": gaps,
+        f"cuts where no report came for {gap} or the file has a break": gaps,
         "steps": len(cells),
         **counts,
     }
