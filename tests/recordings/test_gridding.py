@@ -232,6 +232,11 @@ AT_SEA = seen((0, 0, 1, 1), geographic=True)
             "kernel.step=4.94066e-324: makes inf steps of it, expected ",
         ),
         (seen((0, 0, 5, 5), (0, 5, 7, 5)), {"cell": 5e-324}, "here: no track of at least 1 cells"),
+        (
+            seen((0, 0, 15.42, 47.06), (0, 5, 15.43, 47.061)),  # degrees as x and y
+            {"cell": 100},
+            "here: nearly all positions lie within 0.0098 x 0.00098, far less than a cell (grid.cell=100)",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused(

@@ -359,7 +359,10 @@ def test_a_frame_and_columns_of_ones_own_are_read_as_a_file_is(tmp_path: Path) -
     [
         ({}, "load_tracks: not a table of positions (columns device, seen, x, y: expected id"),
         ({"columns": ["id:nobody", "time:seen"]}, "load_tracks: not a table of positions"),
-        ({"columns": ["who:device"]}, "kernel.columns=['who:device']: expected a list"),
+        (
+            {"columns": ["device:id"]},
+            "kernel.columns=['device:id']: expected a list, each one of id, time, x, y, lat, lon",
+        ),
     ],
 )
 def test_a_column_that_is_not_there_is_named(more: dict[str, Any], message: str) -> None:

@@ -218,7 +218,7 @@ class TracksConfig(KernelConfig):
     )
     columns: list[str] | None = option(
         "a table of positions: names of its columns, such as [id:device_id,time:seen]; of id, time, x, y, lat, lon",
-        expects="id:NAME",
+        expects="one of id, time, x, y, lat, lon with its column, such as id:device_id",
         pattern="(id|time|x|y|lat|lon):.+",
     )
     step: float | None = option(

@@ -22,6 +22,9 @@ _WIDEST = 12.0
 _MOST = 2**27
 """Steps of all tracks together; times in milliseconds and a step in seconds would make thousands for each report."""
 
+_PARTS = 50
+"""Of a cell. A city is a tenth of a degree wide, its cells tens of metres; a continent tens, its cells kilometres."""
+
 
 @dataclass(frozen=True)
 class Gridding:
@@ -67,6 +70,8 @@ def to_tracks(
         UserError: the projection does not fit the positions, or no track is left.
     """
     flat, place = _placed(positions, grid, source, ~np.isin(positions.track, held_out))
+    if not positions.geographic:
+        _check_extent(flat, grid, source)
     begin, x, y, last = _sampled(flat, grid)
     cells = place.cells(x, y, grid.size)
     tracks, counts = _cut(cells, begin, last, flat, grid)
@@ -83,6 +88,19 @@ def to_tracks(
     if not len(tracks):
         raise UserError(f"{source}: no track of at least {grid.shortest} cells; {said(report)}")
     return tracks, report, place
+
+
+def _check_extent(flat: Positions, grid: Gridding, source: str) -> None:
+    """Refuse positions that are all about one cell, as degrees in columns x and y are."""
+    wide, high = (
+        float(np.ptp(np.percentile(known, (1, 99)))) if len(known) else np.inf
+        for known in (column[np.isfinite(column)] for column in (flat.x, flat.y))
+    )
+    if 0 < max(wide, high) < grid.cell / _PARTS:  # 0: nothing moves
+        raise UserError(
+            f"{source}: nearly all positions lie within {wide:.3g} x {high:.3g}, far less than a cell "
+            f"(grid.cell={grid.cell:g}); expected a smaller cell, or columns lat and lon for degrees"
+        )
 
 
 def said(report: Mapping[str, int]) -> str:
