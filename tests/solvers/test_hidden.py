@@ -176,6 +176,9 @@ def test_a_search_can_be_watched_limited_and_interrupted() -> None:
     assert {each.upper for each in seen} == {stopped.upper}
     assert seen[0].left is None
     assert seen[-1].left > 0
+    seen.clear()
+    solve(world, time_limit=1.0, on_progress=seen.append)
+    assert max(each.left for each in seen if each.left is not None) < 1.0
     late = solve(world, time_limit=1e-9)
     assert (late.timed_out, late.interrupted, late.certified) == (True, False, False)
     assert late.lower <= stopped.lower < late.upper

@@ -126,7 +126,7 @@ def _watching(
     def watch(found: Found, share: float) -> bool:
         if on_progress is not None:
             seconds = time.monotonic() - began
-            left = seconds / share - seconds if share else None
+            left = min(seconds / share - seconds, budget.seconds) if share else None
             ends = found.aihtr, best.upper, seconds, best.nodes
             on_progress(SearchProgress(*ends, "search, at most", left))
         return budget.left()

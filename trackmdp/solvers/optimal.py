@@ -184,6 +184,7 @@ class _Run:
         if self.on_progress is not None:
             bracket = float(self.value.mean()), float(self.bound.mean())
             seconds, nodes = time.monotonic() - self.budget.started, self.budget.spent
+            left = None if left is None else min(left, self.budget.seconds)
             self.on_progress(SearchProgress(*bracket, seconds, nodes, stage, left))
 
     def search(self) -> None:

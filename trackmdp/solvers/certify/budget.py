@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 
@@ -15,6 +16,11 @@ class Budget:
         self.nodes, self.spent, self.timed_out = nodes, 0, False
         self.started = time.monotonic()
         self._ends = None if time_limit is None else self.started + time_limit
+
+    @property
+    def seconds(self) -> float:
+        """Until the time limit; inf without one."""
+        return math.inf if self._ends is None else max(0.0, self._ends - time.monotonic())
 
     def left(self) -> bool:
         """Whether there is work left to do."""
