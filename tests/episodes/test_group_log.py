@@ -296,13 +296,13 @@ def test_commands_log_and_replay_several_targets(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["evaluate", "baseline=optimal", "grid.size=3", "targets.count=2", "log=[mcap]"]
-    words += ["kernel.exit_probability=0.1", "episodes=5", "log.mcap.layout=true", "quiet=true"]
+    words += ["kernel.exit_probability=0.1", "episodes=5", "log.mcap.layout=true"]
     for name in ("a", "b"):
         assert main([*words, f"hydra.run.dir={tmp_path / name}"]) == 0
     file = tmp_path / "a" / "episodes.mcap"
     assert file.read_bytes() == (tmp_path / "b" / "episodes.mcap").read_bytes()
     assert "⓿" in (tmp_path / "a" / "picture.txt").read_text(encoding="utf-8")
-    capsys.readouterr()
+    assert "│ AIHTR  " in capsys.readouterr().out
     assert main(["replay", f"file={file}"]) == 0
     assert "3x3 grid with 2 targets" in capsys.readouterr().out
     assert main(["replay", f"file={file}", "verify=true"]) == 0

@@ -261,6 +261,7 @@ def test_nets_learn_of_all_tracks_together(algo: str, tmp_path: Path) -> None:
     few = {"total_frames": 512, "frames_per_batch": 256, "envs": 32, "hidden": 8}
     run = tm.train(targets, algo, folder=tmp_path / algo, **few)
     assert run.several is not None
+    assert [row[0] for row in run.several.rows("learned")] == ["learned", "all on", "no sensors"]
     again = evaluate(targets, tm.load_run(tmp_path / algo))
     assert again.aihtr.mean == run.several.figures.aihtr.mean == run.evaluation.aihtr
 

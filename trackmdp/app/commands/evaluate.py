@@ -152,7 +152,10 @@ def _several(
     report["expected_length"] = found.expected_length
     report["figures"] = {name: asdict(each) for name, each in figures.items()}
     write_json(folder / "evaluation.json", report)
-    rows = [[name.replace("_", " "), with_ends(each)] for name, each in figures.items()]
+    rows = [
+        [_FIGURES.get(name, name.replace("_", " ")), with_ends(each)]
+        for name, each in figures.items()
+    ]
     rows += [] if apart is None else [["AIHTR of separate trackers", f"{apart:,.4f}"]]
     rows += [] if recorded else [["upper bound", f"{upper:,.4f}"]]
     at.print(table(f"{subject}, {len(group)} targets, {rule.name}", ["figure", found.about], rows))
