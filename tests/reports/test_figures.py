@@ -98,6 +98,11 @@ def test_learned_policies_lie_over_the_frontier_of_the_solved_ones() -> None:
     for price, sensors, accuracy in solved:
         assert rows["best known", price][:2] == [sensors, accuracy]
         assert rows["a2c", price][:2] == pytest.approx([sensors + 0.25, accuracy - 0.05])
+    assert "line: " in figure.table.caption
+    unsolved = study([replace(each, references={}) for each in runs])  # as on recordings
+    alone = swept_figure(unsolved, priced)
+    assert alone
+    assert "line: " not in alone.table.caption
 
 
 def test_exact_lines_stand_at_the_true_price_and_learned_ones_beside_it(

@@ -99,7 +99,8 @@ def swept_figure(study: Study, panel: Panel) -> Figure | None:
 
     def paint(figure: Canvas) -> None:
         axes = figure.subplots()
-        _points(axes, hull, vars(REFERENCES["best known"]) | {"label": name})
+        if best:
+            _points(axes, hull, vars(REFERENCES["best known"]) | {"label": name})
         # Also those below the line, which a mixture of their neighbours beats.
         _points(axes, best, {"color": INK, "marker": "+", "linestyle": ""})
         for method, look in looks_of(study.methods).items():
@@ -114,9 +115,9 @@ def swept_figure(study: Study, panel: Panel) -> Figure | None:
         seeds = [len(study.of(worlds[each.price], method)) for each in places]
         rows += [[method, *each, None, n] for each, n in zip(places, seeds, strict=True)]
         counts += seeds
+    line = f"; line: mixtures of two policies, {name}" if best else ""  # none on recordings
     caption = (
-        f"Accuracy against sensors per step at all prices, {title}; line: mixtures of two "
-        f"policies, {name}; n = {max(counts)} seeds"
+        f"Accuracy against sensors per step at all prices, {title}{line}; n = {max(counts)} seeds"
     )
     columns = [Column("policy"), Column("c", 2), Column("sensors per step", 3)]
     columns += [Column("accuracy", 4), Column("on the line"), Column("n")]
