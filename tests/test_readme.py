@@ -73,6 +73,7 @@ def test_the_first_table_holds_the_exact_figures_of_its_world() -> None:
         found = tm.evaluate(world, name)
         figures = [f"{found.aihtr:,.3f}", f"{found.accuracy:.2%}"[:-1], "%"]
         assert shown[row] == [*figures, f"{found.sensors_per_step:.2f}"]
+    assert shown["upper bound"] == [f"{tm.solve(world).upper:.3f}"]
 
 
 def test_the_handbook_lists_all_baselines() -> None:
