@@ -140,7 +140,8 @@ def _several(
 ) -> float:
     """Evaluate for several targets: `evaluation.json`; returns the AIHTR."""
     rule = group_rule(group, policy, cfg.targets.merge)
-    found = evaluate_group(rule, width=cfg.evaluation.width, seed=cfg.seed)
+    with at.status("simulating all targets"):
+        found = evaluate_group(rule, width=cfg.evaluation.width, seed=cfg.seed)
     figures, upper = {name: getattr(found, name) for name in FIGURES}, upper_bound(group)
     apart, recorded = None, group.recorded
     if rule.tables:  # else it was learned for all targets together
