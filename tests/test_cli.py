@@ -17,6 +17,7 @@ import pytest
 
 from tests.config.cases import composed
 from tests.typed import ENVIRONMENT, ROOT, refused, stub, typed
+from trackmdp.app import launch
 from trackmdp.app.cli import COMMANDS, main
 from trackmdp.app.sweep.plan import sweep_name
 from trackmdp.config import GROUPS, ROOTS, options
@@ -344,6 +345,20 @@ sys.exit(main(["train"]))
     _, said = process.communicate(timeout=60)
     assert (process.returncode, said) == (130, "trackmdp train: interrupted\n")
     assert not list(empty_folder.iterdir())
+
+
+def test_ctrl_c_while_a_class_is_made_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """While the package is imported; Python 3.11 raises a RuntimeError in its place."""
+
+    class Interrupted:
+        def __set_name__(self, *_: object) -> None:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(launch, "launch", lambda *_: type("Config", (), {"option": Interrupted()}))
+    assert main(["solve"]) == 130
+    assert capsys.readouterr() == ("", "trackmdp solve: interrupted\n")
 
 
 @pytest.mark.parametrize("kernel", ["random_support", "heading"])

@@ -88,7 +88,8 @@ def _dispatch(words: list[str]) -> int:
 def _report(command: str, error: BaseException) -> int:
     """Print why a command ended, in one line unless it is a bug; returns the exit status."""
     line, status = str(error), FAILED
-    if isinstance(error, KeyboardInterrupt):
+    # Python 3.11 wraps what ends a class statement: a Ctrl-C while the dataclasses of the config are made.
+    if isinstance(error, KeyboardInterrupt) or isinstance(error.__cause__, KeyboardInterrupt):
         line, status = "interrupted", INTERRUPTED
     elif isinstance(error, Preempted):
         status = 128 + error.signal
