@@ -203,6 +203,25 @@ def test_a_file_that_is_no_policy_is_one_line(content: bytes, tmp_path: Path) ->
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("fact", [{"rows": "6"}, {"modes": "2"}, {"clip": "10000000000"}])
+def test_a_model_of_onnx_that_its_metadata_does_not_fit_is_refused_at_once(
+    fact: dict[str, str], tmp_path: Path
+) -> None:
+    """Not at the first step after a detection that it has no row for."""
+    pytest.importorskip("onnxruntime")
+    import onnx
+
+    file, world = tmp_path / "policy.onnx", WORLDS["keys"]
+    tm.export(some(world), file)
+    model = onnx.load(file)
+    facts = {each.key: each.value for each in model.metadata_props}
+    del model.metadata_props[:]
+    onnx.helper.set_model_props(model, facts | fact)
+    onnx.save(model, file)
+    with pytest.raises(UserError, match=r"policy\.onnx: "):
+        tm.Tracker(file, 0)
+
+
 @pytest.mark.parametrize("name", ["paper", "misses", "keys", "mode", "footprints"])
 def test_its_belief_is_that_of_the_log(name: str) -> None:
     """The log holds the belief after the move, before its report; one step earlier this is the tracker's, moved on."""
@@ -233,9 +252,10 @@ def test_belief_needs_a_motion() -> None:
     with pytest.raises(UserError, match="expected a World of 3 x 3 cells"):
         begun(world=WORLD)
     tracker = begun(world=small_world())
-    state = tracker.state() | {"belief": [1.0]}
-    with pytest.raises(UserError, match="state: belief, expected 9 probabilities"):
-        tm.Tracker.restore(Policy.all_on(small_world()), state, small_world())
+    for belief in ([1.0], ["x"] * 9, [[1 / 9]] * 9, [None] * 9, [float("nan")] * 9, [1e308] * 9, 3):
+        state = tracker.state() | {"belief": belief}
+        with pytest.raises(UserError, match="state: belief, expected 9 probabilities"):
+            tm.Tracker.restore(Policy.all_on(small_world()), state, small_world())
     tracker.exited()
     with pytest.raises(UserError, match="the target has exited"):
         tracker.belief()
@@ -319,8 +339,9 @@ def test_modes_are_asked_for_where_detections_give_them() -> None:
         ({"misses": 3}, "state: misses=3: expected an integer from 0 to 2"),
         ({"misses": None}, "state: misses=None: expected"),
         ({"on": [9]}, "state: on=9: expected an integer from 0 to 8"),
+        ({"on": [0, 0]}, "state: on=[0, 0]: expected sensors that can be on, in order"),
         ({"on": 3}, "state: expected a list or None as on"),
-        ({"exited": 1}, "state: expected a list or None as on, True or False as exited"),
+        ({"exited": 1}, "state: expected True or False as exited"),
         ({"task": {}}, "state: made for {}, expected {'size': "),
         (
             {"more": 1},

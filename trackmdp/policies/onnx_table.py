@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from trackmdp.arrays.entries import ones_at
+from trackmdp.arrays.types import BoolArray
 from trackmdp.errors import require
 from trackmdp.grid.place import Place
 from trackmdp.sensing.task import Task
@@ -41,13 +42,21 @@ class OnnxTable:
             about = self._session.get_modelmeta().custom_metadata_map
             sensors = self._session.get_outputs()[0].shape[1]
             self.task = _task(about, int(sensors))
+            # The last row of all: a table of another shape than the metadata is no exported policy.
+            on = self._looked_up(self.task.num_keys - 1, self.task.t_max)
+            if on.shape != (self.task.total_sensors,):
+                raise ValueError(f"{on.shape} sensors, expected {self.task.total_sensors}")
 
     def sensors(self, key: int, misses: int) -> list[int]:
         """The sensors on, n misses after the detection that left `key`."""
+        return np.flatnonzero(self._looked_up(key, misses)).tolist()
+
+    def _looked_up(self, key: int, misses: int) -> BoolArray:
+        """`[S]`, the action of the model."""
         names = (each.name for each in self._session.get_inputs())
         state = {name: np.array([it]) for name, it in zip(names, (key, misses), strict=True)}
         (action,) = self._session.run(["action"], state)
-        return np.flatnonzero(action[0]).tolist()
+        return np.asarray(action[0], dtype=np.bool_)
 
 
 def _task(about: dict[str, str], sensors: int) -> Task:

@@ -11,7 +11,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from trackmdp.arrays.numbers import whole_number
-from trackmdp.arrays.types import Array, BoolArray
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.policies.belief import BeliefFilter
 from trackmdp.policies.onnx_table import OnnxTable
@@ -240,20 +240,26 @@ class Tracker:
                 f"_{name}",
                 whole_number(f"state: {name}", state[name], 0, most.get(name, math.inf)),
             )
-        on, last = state["on"], task.total_sensors - 1
-        if not isinstance(on, list | None) or not isinstance(state["exited"], bool):
-            raise UserError("state: expected a list or None as on, True or False as exited")
-        tracker._on = (
-            None if on is None else [whole_number("state: on", each, 0, last) for each in on]
-        )
-        tracker._exited = state["exited"]
+        if not isinstance(state["exited"], bool):
+            raise UserError("state: expected True or False as exited")
+        tracker._on, tracker._exited = tracker._restored(state["on"]), state["exited"]
         if tracker._filter is not None:
-            belief, states = state["belief"], tracker._belief.shape[1]
-            found = np.array([belief if isinstance(belief, list) else []], dtype=np.float64)
-            if found.shape[1] != states or (found < 0).any() or not 0 < found.sum() < 1.1:
-                raise UserError(f"state: belief, expected {states} probabilities")
-            tracker._belief = found
+            tracker._belief = _probabilities(state["belief"], tracker._belief.shape[1])
         return tracker
+
+    def _restored(self, on: Any) -> list[int] | None:
+        """The sensors that are on in a state.
+
+        Raises:
+            UserError: they are none that can be.
+        """
+        if not isinstance(on, list | None):
+            raise UserError("state: expected a list or None as on")
+        last = self._task.total_sensors - 1
+        found = [whole_number("state: on", each, 0, last) for each in on or ()]
+        if found != sorted(set(found)) or not self._possible(np.array(found, np.int64)).all():
+            raise UserError(f"state: on={found}: expected sensors that can be on, in order")
+        return None if on is None else found
 
     def _facts(self) -> dict[str, Any]:
         """The facts of the task that keys and sensor ids depend on."""
@@ -295,10 +301,9 @@ class Tracker:
 
     def _chosen(self) -> list[int]:
         """The policy's own choice, before any safe action."""
-        policy, task = self._policy, self._task
+        policy = self._policy
         sensors = np.array(policy.sensors(self._key, self._misses), dtype=np.int64)
-        possible = task.choosable(np.full(len(sensors), self.cell), sensors)
-        kept = np.ones(len(sensors), dtype=bool) if possible is None else possible
+        kept = self._possible(sensors)
         sensors = sensors[kept]
         if policy.deterministic:
             return sensors.tolist()
@@ -309,6 +314,26 @@ class Tracker:
             # The k largest of independent uniforms are a uniformly random subset of size k.
             return np.sort(sensors[np.argsort(-draws)[: policy.k]]).tolist()
         return sensors[draws < policy.chances(self._key, self._misses)[kept]].tolist()
+
+    def _possible(self, sensors: IndexArray) -> BoolArray:
+        """Whether each of `sensors` can be on now."""
+        start = None if self.safe else np.full(len(sensors), self.cell)
+        possible = self._task.choosable(start, sensors)
+        return np.ones(len(sensors), dtype=bool) if possible is None else possible
+
+
+def _probabilities(given: Any, states: int) -> Array:
+    """`[1, states]`, the belief in a state.
+
+    Raises:
+        UserError: it is none.
+    """
+    numbers = given if isinstance(given, list) else []
+    if all(type(each) in (int, float) and 0 <= each <= 1.1 for each in numbers):
+        found = np.array([numbers], dtype=np.float64)
+        if found.shape[1] == states and 0 < found.sum() < 1.1:
+            return found
+    raise UserError(f"state: belief, expected {states} probabilities")
 
 
 def _plan(policy: Plan | str | Path) -> Plan:
