@@ -118,5 +118,6 @@ def test_the_environment_keeps_the_key(memory: str) -> None:
 def test_a_task_of_an_unknown_memory_is_refused() -> None:
     with pytest.raises(UserError, match="memory=all: expected one of cell, displacement"):
         Task(3, cost=0.1, t_max=1, memory="all")
-    with pytest.raises(UserError, match="clip=0: expected an integer >= 1"):
-        Task(3, cost=0.1, t_max=1, memory="displacement", clip=0)
+    for clip in (0, 9, 2**62):  # so many keys that their numbers would be no int64
+        with pytest.raises(UserError, match=f"clip={clip}: expected an integer from 1 to 8"):
+            Task(3, cost=0.1, t_max=1, memory="displacement", clip=clip)

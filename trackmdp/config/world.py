@@ -20,6 +20,9 @@ from trackmdp.errors import UserError
 
 BORDERS = ("renormalize", "inside", "clip", "exit")
 CRS_CODE = "[A-Za-z]+:[0-9]{1,9}"
+LARGEST_CLIP = 8
+"""Rows and columns up to which displacements can differ: 289 of them."""
+
 MEMORIES = {
     "cell": "trackmdp.memory.keys:Cell",
     "displacement": "trackmdp.memory.keys:Displacement",
@@ -105,7 +108,7 @@ class TaskConfig(NodeConfig):
     clip: int = count_option(
         "rows and columns up to which displacements differ; larger ones count as that",
         unit="cells",
-        le=8,
+        le=LARGEST_CLIP,
     )
 
     def check(self, key: str, root: Any) -> None:

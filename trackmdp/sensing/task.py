@@ -14,7 +14,7 @@ from scipy import sparse
 from trackmdp.arrays.numbers import PRICES, PROBABILITIES, one_each, whole_number
 from trackmdp.arrays.types import AnyArray, Array, BoolArray
 from trackmdp.config.sensors import LARGEST_PRICE
-from trackmdp.config.world import MEMORIES
+from trackmdp.config.world import LARGEST_CLIP, MEMORIES
 from trackmdp.errors import UserError
 from trackmdp.grid.displacements import apart
 from trackmdp.grid.place import Place
@@ -54,7 +54,7 @@ _RANGES = {
     "max_steps": (1, math.inf),
     "window": (0, 1024),
     "budget": (0, math.inf),
-    "clip": (1, math.inf),
+    "clip": (1, LARGEST_CLIP),
     "revealed": (1, math.inf),
 }
 """Whole numbers of a task: the least and the largest."""
