@@ -89,7 +89,7 @@ def decoded(source: str, expected: str) -> Iterator[None]:
         # A constructor names its argument; the file is named here.
         if str(error).startswith(source):
             raise
-        raise UserError(f"{source}: {error}") from error
+        raise UserError(f"{source}: {printable(str(error))}") from error
     except Exception as error:
         raise UserError(f"{source}: not {expected} ({reason(error)})") from error
 
