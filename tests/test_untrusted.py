@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import resource
 import tracemalloc
 from contextlib import suppress
 from pathlib import Path
@@ -233,6 +234,22 @@ def test_two_who_write_one_file_at_once_leave_one_of_both(tmp_path: Path) -> Non
         assert (tmp_path / "file").read_text() == "second"
     assert (tmp_path / "file").read_text() == "first"
     assert [each.name for each in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("length", [9, 10**6])
+def test_a_disk_that_takes_no_bytes_is_an_error_with_the_name_of_the_file(
+    length: int, tmp_path: Path
+) -> None:
+    """Also of a file of few bytes, which are written first by the flush, and once more when it is closed."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1]))
+        with pytest.raises(OSError, match="too large") as raised:
+            write_text(tmp_path / "file", "x" * length)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert raised.value.filename == str(tmp_path / "file")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_failure_leaves_no_part(tmp_path: Path) -> None:

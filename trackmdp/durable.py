@@ -40,19 +40,20 @@ def whole_file(file: Path) -> Iterator[BufferedRandom]:
     part = _part(file)
     if not file.parent.is_dir():  # else the message would name the hidden file
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(file.parent))
-    with create(part) as stream:
-        try:
+    try:
+        with create(part) as stream:
             yield stream
             # Before the renaming, which may reach the disk before the bytes do: a power failure would leave an empty
             # file under the final name.
             sync(stream, part)
             part.replace(file)
-        except BaseException as error:  # Ctrl-C included
-            part.unlink(missing_ok=True)
-            # A full disk names no file.
-            if isinstance(error, OSError) and error.errno and error.filename is None:
-                error.filename = str(file)
-            raise
+    # Ctrl-C included; outside of the `with`, which closes the stream and so tries once more to write what is left.
+    except BaseException as error:
+        part.unlink(missing_ok=True)
+        # A full disk names no file.
+        if isinstance(error, OSError) and error.errno and error.filename is None:
+            error.filename = str(file)
+        raise
 
 
 def _part(file: Path) -> Path:
