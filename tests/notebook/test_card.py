@@ -142,6 +142,7 @@ def test_a_long_policy_is_cut() -> None:
 
 def test_a_long_value_keeps_both_ends_in_one_line() -> None:
     assert clipped("a\nb", 10) == "a b"
+    assert clipped("\x1b[2J", 10) == "\\x1b[2J"  # the name of somebody's folder or run
     assert clipped("abcdefgh", 5) == "ab…gh"
     card = Card("x" * 300, {"folder": "/home/" + "y" * 200 + "/runs/a"})
     lines = card.text().splitlines()

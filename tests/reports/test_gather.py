@@ -31,6 +31,7 @@ from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.display import make_console
 from trackmdp.training.folders import read_summary, write_summary
 from trackmdp.training.lock import locked
+from trackmdp.training.run import load_run
 from trackmdp.world.make import build_world
 
 Change = Callable[[Path], Any]
@@ -241,6 +242,18 @@ def test_a_run_that_was_changed_is_listed_and_the_others_are_read(case: str, swe
     assert len(found.runs) == 11
     assert reasons(found)["a2c-0.16-0"].startswith(start)
     assert "\n" not in reasons(found)["a2c-0.16-0"]
+
+
+@pytest.mark.parametrize("case", ["policy", "frames", "no length"])
+def test_a_changed_summary_is_refused_when_it_is_read_not_when_it_is_shown(
+    case: str, sweep: Path
+) -> None:
+    change, start = SPOILT[case]
+    run = sweep / "a2c-0.16-0"
+    repr(load_run(run))
+    change(run)
+    with pytest.raises(UserError, match=start):
+        load_run(run)
 
 
 def test_a_run_of_a_version_with_other_options_counts(sweep: Path) -> None:

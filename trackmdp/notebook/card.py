@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 
 from trackmdp.errors import UserError
 from trackmdp.notebook.pictures import picture_of
+from trackmdp.untrusted import printable
 
 MOST_LINES, WIDE = 12, 100
 """Lines of a card, and letters of a line, at most."""
@@ -78,7 +79,7 @@ class Carded:
 
 def clipped(text: str, most: int) -> str:
     """`text` in one line of at most so many letters; of a longer one both ends are kept, as a path needs them."""
-    line = " ".join(text.split())
+    line = printable(" ".join(text.split()))
     if len(line) <= most:
         return line
     # Ten letters in five: "ab…ij", two before the sign and two after it.

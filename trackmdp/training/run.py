@@ -205,13 +205,10 @@ def load_run(folder: str | Path) -> Run:
     else:
         table, value = load_policy(place / "policy.npz")
         policy = Policy.from_table(table)
-    return Run(
-        policy,
-        _evaluation(place, summary, value),
-        read_metrics(place),
-        summary,
-        place,
-    )
+    run = Run(policy, _evaluation(place, summary, value), read_metrics(place), summary, place)
+    with decoded(str(place / SUMMARY), "the summary of a run"):
+        run.card()  # else `repr` would be the first to find that a figure is missing or no number
+    return run
 
 
 def _evaluation(folder: Path, summary: Mapping[str, Any], value: Array | None) -> Evaluation:
