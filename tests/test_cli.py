@@ -347,16 +347,24 @@ sys.exit(main(["train"]))
     assert not list(empty_folder.iterdir())
 
 
-def test_ctrl_c_while_a_class_is_made_is_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+class Interrupted:
+    def __set_name__(self, *_: object) -> None:
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("moment", ["a class is made", "a config is composed"])
+def test_ctrl_c_behind_another_error_is_one_line(
+    moment: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """While the package is imported; Python 3.11 raises a RuntimeError in its place."""
-
-    class Interrupted:
-        def __set_name__(self, *_: object) -> None:
+    def interrupted(*_: object) -> None:
+        if moment == "a class is made":
+            type("Config", (), {"option": Interrupted()})  # in Python 3.11 a RuntimeError
+        try:
             raise KeyboardInterrupt
+        finally:
+            {}["half made"]
 
-    monkeypatch.setattr(launch, "launch", lambda *_: type("Config", (), {"option": Interrupted()}))
+    monkeypatch.setattr(launch, "launch", interrupted)
     assert main(["solve"]) == 130
     assert capsys.readouterr() == ("", "trackmdp solve: interrupted\n")
 

@@ -88,8 +88,7 @@ def _dispatch(words: list[str]) -> int:
 def _report(command: str, error: BaseException) -> int:
     """Print why a command ended, in one line unless it is a bug; returns the exit status."""
     line, status = str(error), FAILED
-    # Python 3.11 wraps what ends a class statement: a Ctrl-C while the dataclasses of the config are made.
-    if isinstance(error, KeyboardInterrupt) or isinstance(error.__cause__, KeyboardInterrupt):
+    if _interrupted(error):
         line, status = "interrupted", INTERRUPTED
     elif isinstance(error, Preempted):
         status = 128 + error.signal
@@ -110,6 +109,17 @@ def _report(command: str, error: BaseException) -> int:
     name = f"trackmdp {command}" if command in COMMANDS else "trackmdp"
     sys.stderr.write(f"{name}: {printable(' '.join(line.split()))}\n")
     return status
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is behind an error.
+
+    Python 3.11 wraps it where a class is made, as while the config is imported; and OmegaConf, interrupted while it
+    composes, fails on what is half made.
+    """
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _run(command: str, words: list[str]) -> int:
