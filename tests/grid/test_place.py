@@ -65,8 +65,12 @@ def test_without_a_place_nothing_is_guessed() -> None:
             UserError, match=r"^(cell|place)_of: the place of the grid is not known"
         ):
             call()
-    with pytest.raises(UserError, match=r"^place_of\(35\): expected a cell from 0 to 34$"):
-        task(PLACES["UTM"]).place_of(35)
+    for cell in (35, 1.0, "x"):
+        with pytest.raises(UserError, match=f"^place_of: cell={cell}: .* from 0 to 34$"):
+            task(PLACES["UTM"]).place_of(cell)  # type: ignore[arg-type]
+    for position in (("x", "y"), (None, 1), (10**400, 1)):
+        with pytest.raises(UserError, match=r"^cell_of: \(.*, expected lat, lon as numbers$"):
+            task(PLACES["UTM"]).cell_of(*position)
     with pytest.raises(UserError, match=r"^place: a dict, expected a Place or None$"):
         task({"cell": 1})  # type: ignore[arg-type]
 
@@ -172,6 +176,9 @@ def test_mistakes_with_positions_end_in_one_line() -> None:
         (lambda: policy.tracker(3, at=(101, -6)), "tracker: cell=3 and at=(101, -6), expected one"),
         (lambda: policy.tracker(), "tracker: no cell and no at, expected the first detection"),
         (lambda: policy.tracker(at=(0, 0)), "cell_of: x, y = 0, 0 is outside of the grid"),
+        (lambda: policy.tracker(at=3), "tracker: at=3, expected two numbers"),
+        (lambda: tracker.report(at=(1, 2, 3)), "report: at=(1, 2, 3), expected two numbers"),
+        (lambda: tm.Tracker(3, 0), "tracker: a int, expected a policy of one target, or its file"),
         (lambda: tracker.report(at=(0, 0)), "cell_of: x, y = 0, 0 is outside of the grid"),
         (lambda: Policy.all_on(small_world()).tracker(at=(0, 0)), "cell_of: the place of the grid"),
     ):

@@ -96,9 +96,12 @@ class Place:
         """The cell of a position (lat, lon) or (x, y).
 
         Raises:
-            UserError: it is outside of the grid.
+            UserError: it is outside of the grid, or no two numbers.
         """
-        first, second = (float(each) for each in position)
+        try:
+            first, second = (float(each) for each in position)
+        except (TypeError, ValueError, OverflowError):
+            raise UserError(f"cell_of: {position!r:.80}, expected {self.axes} as numbers") from None
         x, y = first, second
         if self.crs is not None:
             # A user's order is (lat, lon), that of a projection always (lon, lat).

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol, Self
@@ -276,7 +276,9 @@ class Tracker:
             return cell
         if cell is not None:
             raise UserError(f"{call}: cell={cell} and at={at}, expected one of the two")
-        return self._task.cell_of(*at)
+        if not isinstance(at, Iterable) or len(pair := tuple(at)) != 2:
+            raise UserError(f"{call}: at={at}, expected two numbers")
+        return self._task.cell_of(*pair)
 
     def _locate(self, call: str, cell: int, mode: int | None, *, first: bool = False) -> None:
         """Note a detection; nothing is changed where it is refused."""
@@ -337,8 +339,16 @@ def _probabilities(given: Any, states: int) -> Array:
 
 
 def _plan(policy: Plan | str | Path) -> Plan:
-    """The policy, which may be in a file."""
+    """The policy, which may be in a file.
+
+    Raises:
+        UserError: it is none.
+    """
     if not isinstance(policy, str | Path):
+        if not hasattr(policy, "sensors"):
+            raise UserError(
+                f"tracker: a {type(policy).__name__}, expected a policy of one target, or its file"
+            )
         return policy
     return OnnxTable(policy) if Path(policy).suffix == ".onnx" else load_policy(Path(policy))[0]
 

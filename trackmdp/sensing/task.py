@@ -163,9 +163,8 @@ class Task(Carded):
             UserError: there is no such cell, or the place of the grid is not known.
         """
         place = self._placed("place_of")
-        if not 0 <= cell < self.num_cells:
-            raise UserError(f"place_of({cell}): expected a cell from 0 to {self.num_cells - 1}")
-        return place.place_of(int(cell), self.size)
+        own = whole_number("place_of: cell", cell, 0, self.num_cells - 1)
+        return place.place_of(own, self.size)
 
     def _placed(self, call: str) -> Place:
         if self.place is None:
