@@ -241,7 +241,11 @@ def test_a_run_goes_on_with_its_own_kernel_whatever_became_of_the_file(
 @pytest.mark.parametrize("algo", ["hindsight", "model_based"])
 @pytest.mark.parametrize("later", ["another map", "no map"])
 def test_a_map_of_classes_is_kept_and_no_other_one_taken(
-    algo: str, later: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    algo: str,
+    later: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     classes, file = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1]), tmp_path / "map.npy"
     np.save(file, classes)
@@ -265,6 +269,11 @@ def test_a_map_of_classes_is_kept_and_no_other_one_taken(
     assert (tmp_path / "run" / "policy.npz").read_bytes() == (
         tmp_path / "whole" / "policy.npz"
     ).read_bytes()
+    kept = tmp_path / "run" / PROBLEM
+    kept.write_bytes(problem_bytes(read_problem(kept), 1 - classes))
+    capsys.readouterr()
+    assert main(["evaluate", f"run={kept.parent}"]) == 2
+    assert "belongs to a run with another config or problem" in capsys.readouterr().err
 
 
 def test_events_after_the_checkpoint_are_hidden(

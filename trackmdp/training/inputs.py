@@ -90,13 +90,18 @@ def _as_word(values: Array, folder: Path) -> float | str:
 
 
 def identity(config: TrainConfig, folder: Path, problem: Subject) -> str:
-    """SHA-256 of the problem and of all options that must not change when the run in `folder` is resumed."""
+    """SHA-256 of what must not change when the run in `folder` is resumed: the problem, its classes of cells, options.
+
+    Raises:
+        UserError: the classes in the folder are damaged.
+    """
     # repr writes floats with all digits, so that equal hashes mean equal options.
     options = repr(fixed_options(own_paths(config, folder)))
-    return hashlib.sha256(f"{options} {_digest(problem)}".encode()).hexdigest()
+    classes = file_of_classes(with_own_classes(config, folder).algo)
+    return hashlib.sha256(f"{options} {_digest(problem, classes)}".encode()).hexdigest()
 
 
 @lru_cache(maxsize=1)
-def _digest(problem: Subject) -> str:
+def _digest(problem: Subject, classes: str | None) -> str:
     """`problem_digest`, kept: a large problem takes a second, and each checkpoint asks for it."""
-    return problem_digest(problem)
+    return problem_digest(problem, cell_classes(classes, problem.task.size))
