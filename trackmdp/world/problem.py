@@ -22,3 +22,16 @@ def modelled(problem: Problem, caller: str) -> World:
         kind = type(problem).__name__
         raise UserError(f"{caller}: needs a motion model, expected a World, not a {kind}")
     return problem.model
+
+
+def check_sensors(world: World) -> None:
+    """Refuse a world for the paper's theorems, which are on a sensor in every cell.
+
+    Raises:
+        UserError: some cell has none.
+    """
+    if not world.available.all():
+        cell = int(world.available.argmin())
+        raise UserError(
+            f"cost.sensor: nan in cell {cell} (no sensor); verify: expected a price in every cell"
+        )

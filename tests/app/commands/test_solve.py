@@ -123,6 +123,16 @@ def test_cut_episodes_are_refused(
     assert not (tmp_path / "a").exists()
 
 
+@pytest.mark.parametrize("words", ["verify", "solve verify=true"])
+def test_theorems_need_a_sensor_in_every_cell(
+    tmp_path: Path, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    prices = "cost.sensor=[0.1,null,0.1,0.1,0.1,0.1,0.1,0.1,0.1]"
+    assert main([*words.split(), "grid.size=3", prices, f"hydra.run.dir={tmp_path / 'a'}"]) == 2
+    assert "cost.sensor: nan in cell 1 (no sensor)" in capsys.readouterr().err
+    assert not (tmp_path / "a").exists()
+
+
 @pytest.mark.slow
 def test_ctrl_c_prints_and_saves_the_bracket(tmp_path: Path) -> None:
     world = [

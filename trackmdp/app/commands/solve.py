@@ -25,7 +25,7 @@ from trackmdp.solvers.value import value_of
 from trackmdp.training.display import make_console, reporting, table
 from trackmdp.world.group import Group
 from trackmdp.world.model import World
-from trackmdp.world.problem import Problem, modelled
+from trackmdp.world.problem import Problem, check_sensors, modelled
 
 _BOUNDS = {"paper": bounds.paper, "valid": bounds.valid, "clocked": bounds.clocked}
 
@@ -41,6 +41,8 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem) -> float:
             f"grid.max_steps={cfg.grid.max_steps}: only whole episodes are solved, expected null"
         )
     world = modelled(problem, "solve")
+    if cfg.verify:
+        check_sensors(world)
     if cfg.targets.count > 1:
         return _several(cfg, world, folder, console)
     with reporting(console, f"solve {cfg.solver.name}", _progress) as show:
