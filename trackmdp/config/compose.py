@@ -165,9 +165,14 @@ class Default:
     def __init__(self, key: str, command: str = "train") -> None:
         self.key, self.command = key, command
 
-    def __repr__(self) -> str:
+    @property
+    def value(self) -> Any:
+        """As it stands in `conf/`; of a choice its name."""
         value = attrgetter(self.key)(compose(self.command))
-        return repr(getattr(value, "name", value))
+        return getattr(value, "name", value)
+
+    def __repr__(self) -> str:
+        return repr(self.value)
 
 
 def default(key: str, command: str = "train") -> Any:

@@ -16,7 +16,6 @@ from gymnasium.vector.utils import batch_space
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary
 
-from trackmdp.config.compose import compose
 from trackmdp.config.options import GROUPS, options
 from trackmdp.environment.env import TrackEnv
 from trackmdp.errors import UserError
@@ -215,8 +214,8 @@ def _check_names(given: dict[str, Any]) -> None:
     Raises:
         TypeError: an option is unknown.
     """
-    known, kernel = set(signature(make_world).parameters), given.get("kernel")
-    kernel = compose("compare").kernel.name if kernel is None else kernel
+    parameters = signature(make_world).parameters
+    known, kernel = set(parameters), given.get("kernel", parameters["kernel"].default.value)
     if kernel in GROUPS["kernel"]:
         known |= set(options(GROUPS["kernel"][kernel]))
     for name in sorted(set(given) - known):

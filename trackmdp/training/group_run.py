@@ -28,7 +28,13 @@ from trackmdp.solvers.several.group_value import evaluate_group
 from trackmdp.solvers.several.joint_rule import JointRule
 from trackmdp.solvers.several.merging import Rule
 from trackmdp.solvers.solution import Solution
-from trackmdp.training.evaluator import Evaluator, ExactEvaluator, HeldOutEvaluator, Score
+from trackmdp.training.evaluator import (
+    Evaluator,
+    ExactEvaluator,
+    HeldOutEvaluator,
+    Score,
+    fixed_policies,
+)
 from trackmdp.world.group import Group, Subject
 
 _SCORED = 32
@@ -219,9 +225,8 @@ def beside(
 def _fixed(group: Group) -> dict[str, GroupEvaluation]:
     """Figures of policies that a learned one is compared with on recorded tracks, each target's sets together."""
     assert group.recorded is not None
-    if group.task.budget is not None:
-        return {}
-    return {"all on": evaluate(group, "all_on"), "no sensors": evaluate(group, "none")}
+    policies = {} if group.task.budget is not None else fixed_policies(group.task)
+    return {name: evaluate(group, policy) for name, policy in policies.items()}
 
 
 def _intervals(found: GroupEvaluation) -> dict[str, Any]:
