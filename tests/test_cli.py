@@ -369,6 +369,20 @@ def test_ctrl_c_behind_another_error_is_one_line(
     assert capsys.readouterr() == ("", "trackmdp solve: interrupted\n")
 
 
+def test_errors_that_are_behind_each_other_are_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As those of a file of options that asks for code."""
+
+    def fails(*_: object) -> None:
+        first, second = UserError("first"), UserError("second")
+        second.__context__ = first
+        raise first from second
+
+    monkeypatch.setattr(launch, "launch", fails)
+    assert refused(capsys, "solve") == "first"
+
+
 @pytest.mark.parametrize("kernel", ["random_support", "heading"])
 @pytest.mark.parametrize("command", ["evaluate", "compare"])
 def test_ctrl_c_in_the_search_for_a_baseline_writes_nothing(

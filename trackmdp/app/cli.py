@@ -117,9 +117,13 @@ def _interrupted(error: BaseException | None) -> bool:
     Python 3.11 wraps it where a class is made, as while the config is imported; and OmegaConf, interrupted while it
     composes, fails on what is half made.
     """
-    while error is not None and not isinstance(error, KeyboardInterrupt):
+    passed: set[int] = set()  # an error can be behind itself: `raise a from b`, where b came of a
+    while error is not None and id(error) not in passed:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        passed.add(id(error))
         error = error.__cause__ or error.__context__
-    return error is not None
+    return False
 
 
 def _run(command: str, words: list[str]) -> int:
