@@ -33,14 +33,9 @@ def loaded(code: str, *packages: str) -> list[str]:
     return list(after(f"{code}\nfound = [name for name in {packages!r} if name in sys.modules]"))
 
 
-def test_importing_takes_no_time() -> None:
-    # Processor time, which other processes on the machine do not lengthen as they do the time on the clock.
-    code = "import time\nstart = time.process_time()\nimport trackmdp\nfound = time.process_time() - start"
-    assert min(after(code) for _ in range(3)) <= 0.02
-
-
 def test_importing_loads_nothing_heavy() -> None:
-    assert not loaded("import trackmdp", *HEAVY)
+    # Of the standard library too: `importlib.abc` alone doubles the time, by way of tempfile and random.
+    assert not loaded("import trackmdp", *HEAVY, "tempfile", "inspect", "dataclasses", "asyncio")
 
 
 def test_a_world_needs_neither_torch_nor_hydra() -> None:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
 from types import ModuleType
 
@@ -31,8 +30,11 @@ def _register(registration: ModuleType) -> None:
         )
 
 
-class _Finder(MetaPathFinder):
-    """Finds Gymnasium's registry as Python does; once it is loaded, `_register` follows."""
+class _Finder:
+    """Finds Gymnasium's registry as Python does; once it is loaded, `_register` follows.
+
+    Not a `MetaPathFinder`: Python asks for `find_spec` alone, and `importlib.abc` loads half the standard library.
+    """
 
     def find_spec(
         self,
