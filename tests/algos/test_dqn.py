@@ -38,14 +38,14 @@ def test_the_target_is_chosen_online_and_valued_by_the_target_network() -> None:
     with torch.no_grad():
         following = rows["next"].select(*KEYS)
         best = online(following.clone())["sensor_value"] > 0
-        future = joint_value(target(following.clone()), best)
-        other = joint_value(
-            target(following.clone()), target(following.clone())["sensor_value"] > 0
-        )
+        slow = target(following.clone())
+        base, sensor = slow["base"], slow["sensor_value"]
+        future, other = joint_value(base, sensor, best), joint_value(base, sensor, sensor > 0)
         value = rows["next", "reward"].squeeze(-1) + rows["discount"] * future * ~rows[
             "next", "terminated"
         ].squeeze(-1)
-        error = value - joint_value(online(rows.select(*KEYS)), rows["action"])
+        own = online(rows.select(*KEYS))
+        error = value - joint_value(own["base"], own["sensor_value"], rows["action"])
     assert (future < other - 1e-3).any()
     assert rows["next", "terminated"].any()
     result = loss(rows)

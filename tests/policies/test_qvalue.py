@@ -25,18 +25,21 @@ def values(t_max: int = 1) -> TensorDict:
         return module(random_state(small_world(2, t_max), 200, seed=0))
 
 
+def value(rows: TensorDict, action: Tensor) -> Tensor:
+    """`[B]` Q of an action `[B, 4]`."""
+    return joint_value(rows["base"], rows["sensor_value"], action)
+
+
 def joint(rows: TensorDict) -> Tensor:
     """`[B, 16]` Q of every subset."""
-    return torch.stack(
-        [joint_value(rows, subset.expand(len(rows), 4)) for subset in SUBSETS], dim=1
-    )
+    return torch.stack([value(rows, subset.expand(len(rows), 4)) for subset in SUBSETS], dim=1)
 
 
 def test_the_best_subset_is_found_per_sensor() -> None:
     rows = values()
     greedy = EpsilonFlip(0.0)(rows)["action"]
     best = joint(rows).max(dim=1).values
-    torch.testing.assert_close(joint_value(rows, greedy), best)
+    torch.testing.assert_close(value(rows, greedy), best)
     torch.testing.assert_close(rows["base"].squeeze(-1), best)
     assert len(greedy.unique(dim=0)) > 4
 
@@ -44,7 +47,7 @@ def test_the_best_subset_is_found_per_sensor() -> None:
 def test_the_sensors_add_up() -> None:
     """Q of a subset is Q of none plus the values of its sensors."""
     rows = values()
-    none = joint_value(rows, SUBSETS[0].expand(200, 4))
+    none = value(rows, SUBSETS[0].expand(200, 4))
     torch.testing.assert_close(
         joint(rows), none[:, None] + rows["sensor_value"] @ SUBSETS.T.float()
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from inspect import signature
 from typing import Any, ClassVar, Protocol
 
@@ -203,7 +203,7 @@ def set_learning_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
 def clipped_step(
     loss: Tensor,
     optimizer: torch.optim.Optimizer,
-    parameters: Iterable[nn.Parameter],
+    parameters: Sequence[nn.Parameter],
     max_norm: float,
 ) -> Tensor:
     """One gradient step with the gradient's norm clipped; returns the norm before clipping.
@@ -216,8 +216,14 @@ def clipped_step(
         raise FloatingPointError(f"the loss is {loss.item()}")
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
-    norm = nn.utils.clip_grad_norm_(parameters, max_norm)
+    norm = nn.utils.get_total_norm([each.grad for each in parameters if each.grad is not None])
+    if norm > max_norm:  # else `clip_grad_norm_` would multiply every gradient by one
+        nn.utils.clip_grads_with_norm_(parameters, max_norm, norm)
+    # The moments of what no batch touches sink below 1e-38, where processors take five times as long; beside Adam's
+    # epsilon, 1e-8, they are nothing.
+    torch.set_flush_denormal(True)
     optimizer.step()
+    torch.set_flush_denormal(False)
     return norm
 
 

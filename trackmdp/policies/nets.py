@@ -26,9 +26,7 @@ from trackmdp.policies.joint_nets import last_clock, of_kinds
 from trackmdp.sensing.task import Task
 from trackmdp.sensing.windows import Window
 
-_PAIRS = (
-    2**16
-)  # of cells, once for each class of keys, with displacements kept in memory; 16 x 16 cells have as many
+_PAIRS = 2**16  # of cells, with their displacements kept in memory; 16 x 16 cells have as many
 
 
 class StateEncoder(nn.Module):
@@ -127,14 +125,12 @@ class RelativeBias(nn.Module):
         # one in the middle. On 3 x 3, side 5, from cell 4 (code 6) to cell 5 (code 7): 7 - 6 + 12, right of the middle.
         cell = torch.arange(task.num_cells if self._whole else 0)
         code = cell // task.columns * side + cell % task.columns
-        # On a small grid the places of all pairs of cells are kept, so that a state looks up one row of M numbers; on a
-        # large one, where M² is more than a batch has, each state's places are worked out.
-        few = self._whole and self.classes * len(code) ** 2 <= _PAIRS
+        # On a small grid the places of all pairs of cells are kept: where a batch has more states than there are rows
+        # (class, n, cell), all rows are written out, and a state looks up one of them.
+        few = self._whole and len(code) ** 2 <= _PAIRS
         kept = code - code.unsqueeze(-1) + places // 2 if few else None
         self.register_buffer("_index", kept, persistent=False)
-        self.register_buffer(
-            "_code", code if self._whole and kept is None else None, persistent=False
-        )
+        self.register_buffer("_code", code if self._whole else None, persistent=False)
 
     def forward(
         self, last_cell: Tensor, steps_since_detection: Tensor, key: Tensor | None = None
@@ -145,12 +141,12 @@ class RelativeBias(nn.Module):
             if key is None
             else key % self.classes * self.stages + steps_since_detection
         )
-        if self._index is not None:
-            m = len(self._index)
-            rows = self.table[:, self._index].view(-1, m)
-            return nn.functional.embedding(row * m + last_cell, rows)
         if self._code is None:
             return nn.functional.embedding(row, self.table)
+        m = len(self._code)
+        if self._index is not None and len(self.table) * m <= row.numel():
+            rows = self.table[:, self._index].view(-1, m)
+            return nn.functional.embedding(row * m + last_cell, rows)
         places = self.table.shape[1]
         middle = row * places + places // 2 - self._code[last_cell]
         return self.table.view(-1)[middle.unsqueeze(-1) + self._code]
@@ -285,11 +281,10 @@ class AdditiveQ(nn.Module):
         return self.unit if self.window is None else self.unit[self.window.around(last_cell)]
 
 
-def joint_value(values: TensorDictBase, action: Tensor, budget: int | None = None) -> Tensor:
-    """`[...]` Q(s, a) of `action` `[..., K]` from the `base` and `sensor_value` of a network."""
-    sensor = values["sensor_value"]
+def joint_value(base: Tensor, sensor: Tensor, action: Tensor, budget: int | None = None) -> Tensor:
+    """`[...]` Q(s, a) of `action` `[..., K]` from a network's `base` `[..., 1]` and `sensor_value` `[..., K]`."""
     flipped = action.to(sensor.dtype) - greedy(sensor, budget).to(sensor.dtype)
-    return values["base"].squeeze(-1) + (sensor * flipped).sum(-1)
+    return base.squeeze(-1) + (sensor * flipped).sum(-1)
 
 
 class EpsilonFlip(TensorDictModuleBase):
