@@ -1,7 +1,10 @@
-"""Memory: the machine's free bytes, and sizes as they are typed and printed."""
+"""Memory and threads: the machine's free bytes, sizes as they are typed and printed, the threads of networks."""
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from trackmdp.errors import UserError
@@ -61,6 +64,24 @@ def check_free(what: str, needed: float) -> None:
     """
     if needed > _LITTLE and needed > (free := free_bytes()):
         raise UserError(f"{what}: needs about {gib(needed)}, {gib(free)} are available")
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Run networks with so many threads: networks of few rows wait long for more than one.
+
+    The number is the whole process's; afterwards it is the former one again.
+    """
+    torch = sys.modules.get("torch")
+    if torch is None:  # then there is no network either
+        yield
+        return
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _entry(file: Path, name: str, unit: int) -> int | None:

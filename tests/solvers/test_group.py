@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import trackmdp as tm
 from tests.solvers.worlds import random_tiny_world
@@ -304,6 +305,22 @@ def test_a_width_that_is_never_reached_ends_at_the_most_episodes(
     monkeypatch.setattr(group_value, "_MOST", 100)
     world = tm.make_world("random_walk", size=4, exit_probability=0.2)
     assert len(evaluate(Group([world] * 3), "qmdp", width=5e-324).totals) == 100
+
+
+def test_networks_have_one_thread_meanwhile_and_the_process_its_own_again() -> None:
+    world, seen = tiny(0), set[int]()
+
+    def nothing(cell: torch.Tensor, n: torch.Tensor, history: torch.Tensor) -> torch.Tensor:
+        seen.add(torch.get_num_threads())
+        return torch.zeros(len(cell), 3, dtype=torch.bool)
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        evaluate(Group([world] * 2), nothing, width=1.0)
+        assert (seen, torch.get_num_threads()) == ({1}, 2)
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_other_targets_and_policies_are_refused() -> None:

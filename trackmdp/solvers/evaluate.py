@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.errors import UserError
+from trackmdp.machine import torch_threads
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import value
 from trackmdp.solvers.evaluation import Evaluation
@@ -86,7 +87,8 @@ def _of_group(
     group: Group, policy: Any, *, merge: str | None = None, width: float = 0.005, seed: int = 0
 ) -> GroupEvaluation:
     """See `evaluate`."""
-    return evaluate_group(group_rule(group, policy, merge), width=width, seed=seed)
+    with torch_threads(1):
+        return evaluate_group(group_rule(group, policy, merge), width=width, seed=seed)
 
 
 def group_rule(group: Group, policy: Any, merge: str | None = None) -> Rule:

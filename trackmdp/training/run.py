@@ -21,6 +21,7 @@ from trackmdp.arrays.types import Array
 from trackmdp.config import load_run_config
 from trackmdp.config.tree import config_digest
 from trackmdp.errors import UserError
+from trackmdp.machine import torch_threads
 from trackmdp.notebook.card import NONE, Card, Carded, decimal, grid_words
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import load_policy
@@ -117,13 +118,8 @@ def complete(trainer: Learning) -> Run:
     Raises:
         UserError, Preempted, RunError: see `trainer.Trainer.run`.
     """
-    # The number of threads is the whole process's: a caller of `train` from Python gets the former number back.
-    before = torch.get_num_threads()
-    torch.set_num_threads(trainer.config.threads)
-    try:
+    with torch_threads(trainer.config.threads):
         return _complete(trainer)
-    finally:
-        torch.set_num_threads(before)
 
 
 def _complete(trainer: Learning) -> Run:
