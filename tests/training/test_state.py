@@ -329,20 +329,13 @@ def test_weights_are_taken_where_they_fit(
     )
     assert "encoder.cell.weight" in taken
     assert "encoder.history.weight" not in taken
-    assert (
-        main(
-            [
-                "train",
-                *SMALL["dqn"],
-                *BUDGET,
-                *QUICK,
-                f"hydra.run.dir={tmp_path / 'none'}",
-                words[0],
-            ]
-        )
-        == 2
-    )
-    assert "none of its weights has the name and shape of one of ours" in capsys.readouterr().err
+    for algo, message in (
+        ("dqn", "none of its weights has the name and shape of one of ours"),
+        ("hindsight", "the learner makes its networks from its data"),
+    ):
+        folder = f"hydra.run.dir={tmp_path / algo}"
+        assert main(["train", *SMALL[algo], *BUDGET, *QUICK, folder, words[0]]) == 2
+        assert message in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
 
 

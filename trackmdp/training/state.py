@@ -105,14 +105,18 @@ def take_weights(algorithm: Algorithm, run: Path, device: torch.device) -> list[
     """Start from the weights of another run's newest checkpoint, where name and shape fit; returns the names taken.
 
     Raises:
-        UserError: there is no such run, it has no checkpoint, or nothing of it fits.
+        UserError: there is no such run, it has no checkpoint, nothing of it fits, or there are no networks yet.
     """
     file = checkpoint.newest(run, "init_from")
     state = checkpoint.load(file, device)
     own, taken = algorithm.state_dict(), []
+    if not (ours := _weights(own)):
+        raise UserError(
+            f"init_from={run}: the learner makes its networks from its data, expected null, or a2c, ppo or dqn"
+        )
     with torch.no_grad(), decoded(str(file), "the weights of a run"):
         given = dict(_weights(state["algorithm"]))
-        for name, tensor in _weights(own):
+        for name, tensor in ours:
             if name in given and given[name].shape == tensor.shape:
                 # Into the tensors of our own state, which is then loaded as a whole: state_dict may have handed out
                 # copies.
