@@ -16,6 +16,7 @@ from tests.solvers.worlds import (
 )
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluate import evaluate
+from trackmdp.world.make import make_world
 from trackmdp.world.model import World
 
 
@@ -67,6 +68,13 @@ def test_the_clocked_table_solves_its_equation(world: World) -> None:
         np.testing.assert_allclose(table[:, n], expected, rtol=1e-9, atol=1e-9)
     forced = world.kernel @ (world.reward - world.safe_cost + table[:, 0])
     np.testing.assert_allclose(table[:, -1], forced, rtol=1e-9, atol=1e-9)
+
+
+def test_a_safe_action_that_nobody_would_take_may_cost_anything() -> None:
+    # A margin relative to the whole table, D in it, would swallow every gain of a step.
+    world = make_world("random_support", size=3, support_size=3, cost=0.22)
+    dear, dearest = (bounds.clocked(world.but(safe_cost=price)) for price in (1e4, 1e12))
+    np.testing.assert_allclose(dearest, dear, rtol=1e-9)
 
 
 def test_a_probability_equal_to_the_threshold_is_sensed_whatever_its_rounding() -> None:

@@ -211,7 +211,8 @@ def _clocked(world: World, *, exact: bool) -> ClockedBound:
         if improved.same_as(choices):
             break
         candidate, solved = _value(world, improved, table)
-        if candidate.sum() <= table.sum():  # only rounding is left to gain
+        # Only rounding is left to gain; of the last column, where D may be any number, it would be the most.
+        if candidate[:, :-1].sum() <= table[:, :-1].sum():
             break
         choices, table = improved, candidate
     # Iterated solves leave Û off by a little, and so do linear programs; with rho the excess of one improvement step
@@ -259,10 +260,12 @@ def _improved(world: World, table: Array, choices: _Choices, *, exact: bool) -> 
     # Both sides of the comparison are multiplied by the probability p of the move; a target missed by a sensor that is
     # on is worth p (1 - p_d) U(j, n + 1) on both: it is on iff p p_d (r + U(j, 0) - U(j, n + 1)) > c p_in.
     on = np.zeros(choices.on.shape, dtype=bool)
-    # Without a margin, rounding could switch a tied choice to and fro for ever.
-    tie = 1e-12 * (1.0 + np.abs(table).max())
     for n in free:
-        gain = moves.gained(_reports_worth(world, table, n)[:, None]) - price
+        worth = _reports_worth(world, table, n)[:, None]
+        gain = moves.gained(worth) - price
+        # Without a margin, rounding could switch a tied choice to and fro for ever. It is that of the numbers compared:
+        # beside a large D in the last column no gain would count.
+        tie = 1e-12 * (1.0 + np.abs(table[:, 0]).max() + moves.gained(np.abs(worth)))
         before = choices.on[:, n : n + 1]
         chosen = np.where(np.abs(gain) <= tie, before, gain > 0)
         if moves.budget is not None:
