@@ -17,8 +17,9 @@ from trackmdp.app.cli import main
 from trackmdp.config.compose import compose
 from trackmdp.errors import Preempted, UserError
 from trackmdp.signals import Signals, handled, stop
-from trackmdp.solvers import regions, workers
+from trackmdp.solvers import optimal, regions, workers
 from trackmdp.solvers.partition import Block, blocks, default_halo, plan_by_blocks, reach, sub_world
+from trackmdp.solvers.regions import region_side
 from trackmdp.solvers.solve import run_solver
 from trackmdp.solvers.workers import Crew, crew, in_turn
 from trackmdp.world.model import World
@@ -88,6 +89,25 @@ def test_blocks_are_certified_where_the_whole_grid_is() -> None:
     assert parts.certified
     assert parts.lower == pytest.approx(whole.lower, abs=1e-6 * abs(whole.lower))
     assert not tm.solve(world, block=5, sweeps=0).certified  # the blocks alone
+
+
+def test_blocks_and_regions_without_a_sensor_have_nothing_to_plan(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    cost = np.full((8, 8), np.nan)
+    cost[:, 6:] = 0.1
+    world = tm.make_world("random_walk", size=8, cost=cost, t_max=0, safe_cost=2.0)
+    whole, parts = tm.solve(world), tm.solve(world, block=3)
+    with monkeypatch.context() as patch:
+        patch.setattr(optimal, "region_side", lambda *_: 2)
+        regional = optimal.solve(world)
+    for found in (parts, regional):
+        assert found.certified
+        assert found.lower == pytest.approx(whole.lower, abs=1e-9)
+    fence = np.full((28, 28), np.nan)
+    fence[0] = 0.1
+    # Memory is estimated on the middle of the grid, where there is none.
+    assert region_side(tm.make_world("random_walk", size=28, cost=fence, t_max=0)) is None
 
 
 @pytest.mark.slow

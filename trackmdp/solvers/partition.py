@@ -88,6 +88,12 @@ def blocks(size: tuple[int, int], side: int, halo: int) -> list[Block]:
     ]
 
 
+def sensing_blocks(world: World, side: int, halo: int) -> list[Block]:
+    """The `blocks` of a grid that see a sensor: in others there is nothing to plan."""
+    parts = blocks(world.size, side, halo)
+    return [part for part in parts if world.available[cells_of(part.seen, world.columns)].any()]
+
+
 def sub_world(world: World, seen: Rectangle) -> World:
     """The world inside a rectangle of the grid; a target that leaves it has exited."""
     rows, columns = seen
@@ -127,7 +133,7 @@ def plan_by_blocks(
     Raises:
         UserError: a policy that draws was planned.
     """
-    parts = blocks(world.size, block, default_halo(world) if halo is None else halo)
+    parts = sensing_blocks(world, block, default_halo(world) if halo is None else halo)
     ends = np.linspace(0, len(parts), min(_JOBS, len(parts)) + 1).astype(int)
 
     def some(job: int) -> list[tuple[int, World, Block]]:

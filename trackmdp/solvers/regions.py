@@ -17,6 +17,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
+from trackmdp.config.sensors import LARGEST_PRICE
 from trackmdp.errors import UserError
 from trackmdp.machine import free_bytes, gib, parse_bytes
 from trackmdp.policies.table import PolicyTable
@@ -26,7 +27,15 @@ from trackmdp.solvers.certify.inner import InnerProblem
 from trackmdp.solvers.certify.known import adopted, planted
 from trackmdp.solvers.exchange import exchange, hopeful, revealed
 from trackmdp.solvers.linear import DIRECT_CELLS, forced_worth
-from trackmdp.solvers.partition import Pairs, blocks, cells_of, end_to_end, reach, sub_world, within
+from trackmdp.solvers.partition import (
+    Pairs,
+    cells_of,
+    end_to_end,
+    reach,
+    sensing_blocks,
+    sub_world,
+    within,
+)
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import candidates_of, columns_of
 from trackmdp.solvers.value import value_of
@@ -138,6 +147,8 @@ def _predicted(world: World) -> float:
     rows, columns = (
         range(max(side - PATCH, 0) // 2, min(side + PATCH, 2 * side) // 2) for side in world.size
     )
+    if not world.available[cells_of((rows, columns), world.columns)].any():
+        world = world.but(cost=LARGEST_PRICE)  # nothing is sensed there
     patch, entries = sub_world(world, (rows, columns)), list[int]()
     rule = rules.clocked_rule(patch)
 
@@ -165,7 +176,7 @@ def _region_bytes(world: World, side: int) -> int:
 def _regions(world: World, policy: PolicyTable, value: Array, side: int) -> Made[_Region]:
     detected = world.reward + value
     worth = (value, detected, forced_worth(world, detected))
-    parts = blocks(world.size, side, reach(world) * world.num_choices)
+    parts = sensing_blocks(world, side, reach(world) * world.num_choices)
 
     def region(number: int) -> _Region:
         block = parts[number]

@@ -26,7 +26,13 @@ from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.seeding import derive, preserved_global_rng
 from trackmdp.signals import HEARD, handled, stop
-from trackmdp.solvers.partition import Block, blocks, default_halo, narrow_halo, plan_by_blocks
+from trackmdp.solvers.partition import (
+    Block,
+    default_halo,
+    narrow_halo,
+    plan_by_blocks,
+    sensing_blocks,
+)
 from trackmdp.solvers.workers import crew
 from trackmdp.training.callbacks import Callback, Learning, Position
 from trackmdp.training.display import make_console
@@ -92,7 +98,7 @@ class BlockTrainer(Learning):
         cfg, began = self.config.partition, time.monotonic()
         halo, side = default_halo(world) if cfg.halo is None else cfg.halo, cfg.block
         assert side is not None
-        parts = blocks(world.size, side, halo)
+        parts = sensing_blocks(world, side, halo)
         with ExitStack() as opened:
             place = self.folder or Path(opened.enter_context(TemporaryDirectory()))
             resumed = self.folder is not None and _resumed(self.config, world, place)
