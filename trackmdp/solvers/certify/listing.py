@@ -142,6 +142,7 @@ def _all_sets(
 def _small_sets(places: Sequence[IndexArray], budget: int) -> tuple[int, _Bits] | None:
     """All combinations of sets of at most `budget` sensors, the first step's changing fastest."""
     widths = [int(place.max(initial=-1)) + 1 for place in places]
+    budget = min(budget, max(widths))
     counts = [sum(math.comb(width, k) for k in range(budget + 1)) for width in widths]
     if math.prod(counts) > 2**_MOST_BITS or max(widths) > 62:
         return None
