@@ -215,6 +215,13 @@ def test_simulation_agrees_with_the_joint_chain(budget: int | None) -> None:
         assert exact.sensors_per_step.mean <= budget
 
 
+@pytest.mark.parametrize("size", [2, 7])
+def test_targets_that_leave_at_once_earn_nothing(size: int) -> None:
+    world = World(np.zeros((size**2, size**2)), size, cost=0.1)
+    found = evaluate(Group([world] * 2), "qmdp")
+    assert (found.aihtr.mean, found.expected_length) == (0.0, 1.0)
+
+
 def test_no_sensors_at_all_leave_every_second_step_to_the_safe_action() -> None:
     world = tiny(0)
     group = Group([world] * 2)

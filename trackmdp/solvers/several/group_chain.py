@@ -85,7 +85,8 @@ def explored(group: Group, choices: Callable[[Joint], list[IndexArray]], most: i
     starts = itertools.product(*(range(kind * cells, (kind + 1) * cells) for kind in kinds))
     joint: list[Joint] = [tuple((z, 0, ((z, 1.0),)) for z in each) for each in starts]
     number, first = {each: place for place, each in enumerate(joint)}, len(joint)
-    owner, totals, entries = list[int](), list[Array](), list[tuple[int, int, float]]()
+    owner, totals = list[int](), list[Array]()
+    rows, columns, chances = list[int](), list[int](), list[float]()
     for place in itertools.count():
         if place == len(joint):
             break
@@ -98,12 +99,13 @@ def explored(group: Group, choices: Callable[[Joint], list[IndexArray]], most: i
                     if after not in number:
                         number[after] = len(joint)
                         joint.append(after)
-                    entries.append((row, number[after], chance))
+                    rows.append(row)
+                    columns.append(number[after])
+                    chances.append(chance)
             owner.append(place)
             totals.append(total)
         if len(joint) > most:
             return None
-    rows, columns, chances = (np.array(part) for part in zip(*entries, strict=True))
     moves = sparse.csr_array((chances, (rows, columns)), shape=(len(owner), len(joint)))
     return Chain(len(joint), first, np.array(owner), np.array(totals), moves)
 

@@ -36,7 +36,8 @@ class GroupEvaluation(Carded):
 
     def _ratio(self, part: int, whole: int) -> MeanInterval:
         if self.exact:
-            value = float(self.totals[0, part] / self.totals[0, whole])
+            some, every = self.totals[0, [part, whole]].tolist()
+            value = some / every if every else math.nan
             return MeanInterval(value, value, value, 1)
         return ratio(self.totals[:, part], self.totals[:, whole])
 

@@ -179,8 +179,9 @@ class _Batch:
         wanted = self.sums[begin] + self.moves.random(self.shape)
         entry = np.searchsorted(self.sums, wanted, side="right") - 1
         present = before & (entry < end)
-        entry = np.clip(entry, begin, len(kernel.indices) - 1)
-        return np.where(present, kernel.indices[entry], self.place), present
+        place = self.place.copy()
+        place[present] = kernel.indices[entry[present]]
+        return place, present
 
     def _followed(self, present: BoolArray, seen: BoolArray) -> Reports:
         """Which targets are followed on after a step, and which of them were located."""
