@@ -22,6 +22,7 @@ from trackmdp.sensing.task import Task, window_cells
 
 _AT_ONCE = 2**19
 """Entries looked up or checked at once: some 16 MB of intermediate arrays, however large the grid."""
+_SMALL = 2**20  # entries of a table that is kept dense for look-ups
 
 
 class SetTable:
@@ -62,7 +63,7 @@ class SetTable:
         """`[E]` probability that `sensors` `[E]` are on, after n misses in each plan `[E]`."""
         if self.sets is None:
             return np.full(len(plans), float(self.probability or 0.0))
-        return self._looked_up(self.sets, n, plans, sensors)
+        return self._looked_up(self._chosen, n, plans, sensors)
 
     def reports(self, n: int, plans: AnyArray, cells: AnyArray) -> Array:
         """`[E]` probability that a target in `cells` `[E]` is reported after n misses in each plan."""
@@ -71,11 +72,17 @@ class SetTable:
             return self.chosen(n, plans, cells) * task.detects(cells)
         if self.sets is None:
             return self._share[cells]
-        return self._looked_up(self.reporting, n, plans, cells)
+        return self._looked_up(self._reported, n, plans, cells)
 
-    def _looked_up(
-        self, table: sparse.csr_array, n: int, plans: AnyArray, columns: AnyArray
-    ) -> Array:
+    @cached_property
+    def _chosen(self) -> Any:
+        return _quick(self.sets)
+
+    @cached_property
+    def _reported(self) -> Any:
+        return _quick(self.reporting)
+
+    def _looked_up(self, table: Any, n: int, plans: AnyArray, columns: AnyArray) -> Array:
         """`[E]`, the entries of row plan (t_max + 1) + n of a table in `columns`."""
         found = np.empty(len(columns))
         for begin in range(0, len(columns), _AT_ONCE):
@@ -338,6 +345,11 @@ class PolicyTable(Carded, SetTable):
             facts["memory"] |= {"revealed": task.revealed} if task.revealed > 1 else {}
             facts["memory"] |= task.keys.recipe()
         return facts
+
+
+def _quick(table: sparse.csr_array) -> Any:
+    """The table dense where it is small: SciPy takes fifty microseconds before it looks up the first entry."""
+    return table.toarray() if table.shape[0] * table.shape[1] <= _SMALL else table
 
 
 def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:

@@ -31,6 +31,10 @@ from trackmdp.motion.chain import Motion
 from trackmdp.recordings.tracks import ends_of
 from trackmdp.sensing.task import Task
 
+_FEW = 2**14
+"""States whose moves are gathered here: before SciPy looks at a single one, it takes a tenth of a millisecond."""
+_NONE = sparse.csr_array((0, 0))
+
 
 @dataclass(frozen=True, eq=False)
 class Events:
@@ -87,7 +91,8 @@ class Step:
         n: misses before.
         rows: `[E]`, event of each entry.
         states: `[E]`, the target's state.
-        moves: `[E_before, E]`, probability of each move, from the entries of the step before, or from the events.
+        moves: `[E_before, E]`, probability of each move, from the entries of the step before, or from the events;
+            empty where the walk is not closed.
         following: `[E]`, the event that a detection leads to (or its code, see `Events`).
         missed: `[E]`, the same for a miss of the safe action; None at free choices, and where it never misses.
         before: `[E_before]`, event of each entry before the move.
@@ -165,23 +170,36 @@ class Walk:
         from_rows, from_states = rows, states
         if self._live is not None:
             from_rows, from_states = rows[self._live], states[self._live]
-        out = motion.moves
-        if len(from_states) != motion.num_states or (np.diff(from_states) != 1).any():
-            out = motion.moves[from_states]
-        counts = np.diff(out.indptr)
-        source = np.repeat(from_rows, counts)
-        to, target = out.indices, None
+        data, to, counts = self._out(from_states)
+        source, target = np.repeat(from_rows, counts), None
         if len(from_rows) > 1 and not (from_rows[1:] > from_rows[:-1]).all():
             # Event 2 in state 5 of 16 states has the number 2 * 16 + 5 = 37; sorted numbers are the new entries.
             codes = source.astype(np.int64) * motion.num_states + to
             codes, target = np.unique(codes, return_inverse=True)
             source, to = np.divmod(codes, motion.num_states)
-            source, to = source.astype(rows.dtype), to.astype(out.indices.dtype)
-        moves = _moves(out, target, counts, self._live, (len(rows), len(source)))
+            source = source.astype(rows.dtype)
+            to = to.astype(motion.moves.indices.dtype)
+        moves = _NONE
+        if self._closed:
+            moves = _moves(data, target, counts, self._live, (len(rows), len(source)))
         step = self._step(source, to, moves, begun, last=last)
         self._rows, self._states, self._live = source, to, None
         self._n += 1
         return step
+
+    def _out(self, states: IndexArray) -> tuple[Array, IndexArray, IndexArray]:
+        """Probability and new state `[E]` of each move out of `states`, and how many each of them has."""
+        moves = self._motion.moves
+        if len(states) >= _FEW:
+            if len(states) != self._motion.num_states or (np.diff(states) != 1).any():
+                moves = moves[states]
+            return moves.data, moves.indices, np.diff(moves.indptr)
+        begin = moves.indptr[states]
+        counts = moves.indptr[states + 1] - begin
+        # Rows of 2, 0 and 1 entries that begin at 7, 9 and 4: 7 8 4, which is 0 1 2 and 7 7 2.
+        places = np.repeat(begin - np.cumsum(counts) + counts, counts)
+        places += np.arange(len(places), dtype=places.dtype)
+        return moves.data[places], moves.indices[places], counts
 
     def _begin(self, begun: int) -> None:
         """Add the missed targets of the safe action, which move as the others do."""
@@ -237,23 +255,23 @@ class Walk:
 
 
 def _moves(
-    out: sparse.csr_array,
+    data: Array,
     target: IndexArray | None,
     counts: IndexArray,
     live: IndexArray | None,
     shape: tuple[int, int],
 ) -> sparse.csr_array:
-    """`[E_before, E]` of the moves `out` of `live` entries, each to its `target`, or to an entry of its own."""
-    pointer = out.indptr
+    """`[E_before, E]` of the moves `data` of `live` entries, each to its `target`, or to an entry of its own."""
+    every: Indices = counts.astype(np.int64, copy=False)
     if live is not None:
         every = np.zeros(shape[0], dtype=np.int64)
         every[live] = counts
-        pointer = np.concatenate([[0], np.cumsum(every)])
-    width = _width(max(len(out.data), *shape))
+    pointer = ends_of(every)
+    width = _width(max(len(data), *shape))
     target = (
         np.arange(shape[1], dtype=width) if target is None else target.astype(width, copy=False)
     )
-    return sparse.csr_array((out.data, target, pointer.astype(width, copy=False)), shape=shape)
+    return sparse.csr_array((data, target, pointer.astype(width, copy=False)), shape=shape)
 
 
 def _width(count: int) -> type[np.int32] | type[np.int64]:
