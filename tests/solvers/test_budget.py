@@ -46,7 +46,7 @@ def test_optimum_of_tiny_worlds_is_that_of_brute_force(seed: int) -> None:
 
 
 def test_a_budget_above_all_sensors_is_none() -> None:
-    world = tiny(0, 0)
+    world = tiny(6, 0)
     one, other = solve(world.but(budget=10**18)), solve(world.but(budget=None))
     np.testing.assert_allclose(one.value, other.value, rtol=1e-9, atol=1e-9)
 
