@@ -340,6 +340,7 @@ def test_a_frame_and_columns_of_ones_own_are_read_as_a_file_is(tmp_path: Path) -
             (table, {"columns": dict(each.split(":") for each in COLUMNS)}),
             (tmp_path / "a.csv", {"columns": COLUMNS}),
             (usual, {}),
+            (table.set_axis(range(4), axis=1), {"columns": ["id:0", "time:1", "x:2", "y:3"]}),
             (tmp_path / "b.csv", {}),
         )
     }
