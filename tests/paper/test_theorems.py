@@ -54,6 +54,11 @@ def test_every_claim_holds_where_beliefs_spread() -> None:
     assert not printed.expected
 
 
+def test_every_claim_holds_whatever_the_safe_action_costs() -> None:
+    world = paper_world(4, 0.16, 1, 3).but(safe_cost=1e9)
+    assert all(row.passed for row in checks(world).values())
+
+
 def _solution(world: World, chains: BoolArray) -> Solution:
     table = PolicyTable.from_dense(world, chains)
     return replace(optimal.solve(world), table=table, evaluation=evaluate(world, table))

@@ -42,8 +42,7 @@ def check_theorems(world: World, solution: Solution, tolerance: float) -> Iterat
         solution: its optimum; where it is not certified, deviations include the open gap.
         tolerance: deviation, relative to the largest value, that counts as equal.
     """
-    # Values grow with the length of an episode (200 steps at p_exit = .005), and rounding with them.
-    scale = tolerance * max(1.0, float(np.abs(solution.bound).max()))
+    scale = tolerance * _largest(world, solution)
     near = (world, solution)
     if world.num_cells > MOST_CELLS:
         near = (corner(world), optimum.solve(corner(world), tolerance=SLACK))
@@ -74,7 +73,7 @@ def check_modes(world: World, solution: Solution, tolerance: float) -> Iterator[
     for name, statement in _OF_CELLS.items():
         note = "the next move depends on a mode as well: the last cell is no state"
         yield Check(name, statement, NO_CASE, holds=True, note=note)
-    scale = tolerance * max(1.0, float(np.abs(solution.bound).max()))
+    scale = tolerance * _largest(world, solution)
     for row in (*proofs.of_values(corner(world)), *proofs.of_bounds(corner(world))):
         yield row.judged(scale)
     plain, bound = value_of(world, rules.qmdp(averaged(world))), bounds.clocked(world)
@@ -86,6 +85,13 @@ def check_modes(world: World, solution: Solution, tolerance: float) -> Iterator[
     above, note = plain.aihtr - solution.lower, f"Q_MDP {plain.aihtr:.6f}"
     statement = "Q_MDP for the moves of cells, modes averaged <= the policy found"
     yield Check("order", statement, above, expected=False, note=note).judged(scale)
+
+
+def _largest(world: World, solution: Solution) -> float:
+    """The size of values that deviations are relative to."""
+    # Values grow with the length of an episode (200 steps at p_exit = .005), and rounding with them; a hundredth of D
+    # counts as well, since its digits are lost in differences.
+    return max(1.0, float(np.abs(solution.bound).max()), 0.01 * world.safe_cost)
 
 
 def check_remarks(tolerance: float) -> Iterator[Check]:
