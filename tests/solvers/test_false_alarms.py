@@ -19,6 +19,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.false_alarms import believed
+from trackmdp.world.group import Group
 from trackmdp.world.make import make_world
 from trackmdp.world.model import World
 
@@ -203,6 +204,8 @@ def test_what_has_no_exact_value_is_refused() -> None:
     ):
         with pytest.raises(UserError, match=told):
             believed(*given)
+    with pytest.raises(UserError, match=r"false_alarm=0.1: expected 0 with several targets"):
+        evaluate(Group([world] * 2), policy, false_alarm=0.1)  # type: ignore[call-overload]
 
 
 def test_the_command_values_a_baseline_and_a_trained_policy(tmp_path: Path) -> None:

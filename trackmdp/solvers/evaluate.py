@@ -72,6 +72,8 @@ def evaluate(
         UserError: the policy draws at random with unknown probabilities, or is for another grid.
     """
     if isinstance(problem, Group):
+        if false_alarm:
+            raise UserError(f"false_alarm={false_alarm}: expected 0 with several targets")
         return _of_group(problem, policy, **of_group)
     check_problem(problem, "evaluate")
     if of_group:
