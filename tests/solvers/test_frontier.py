@@ -253,6 +253,8 @@ def test_ctrl_c_leaves_the_corners_found_so_far() -> None:
         (small(None), {"resolution": 0.0}, "resolution=0.0: expected"),
         (small(None), {"solver": "qmpd"}, "solver=qmpd: expected one of"),
         (small(None), {"nodes": 0}, "solver.nodes=0: expected"),
+        (small(None), {"near": -1.0}, "near=-1.0: expected"),
+        (small(None), {"near": float("nan")}, "near=nan: expected"),
         (small(None), {"depht": 3}, "solver.depht: unknown option"),
         (replace(small(None), max_steps=9), {}, "max_steps=9: .* expected null"),
         (replace(small(None), reward=0.0), {}, "reward=0: expected"),

@@ -87,6 +87,8 @@ def frontier(
         >>> found.certified, found.corners[0].sensors, round(found.corners[-1].accuracy, 6)
         (True, 0.0, 1.0)
     """
+    if near is not None and not near >= 0:  # nor nan
+        raise UserError(f"near={near}: expected a number of sensors >= 0")
     own = {f"solver.{name}": value for name, value in options.items()}
     named = {"solver": solver, "solver.nodes": nodes, "solver.time_limit": time_limit}
     cfg = compose("frontier", given(named | {"resolution": resolution}) | own)
