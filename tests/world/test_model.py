@@ -51,6 +51,11 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
         UserError, match=r"cost: 3 values, expected one number or 4 \(one per cell\)"
     ):
         Task(2, cost=np.zeros(3), safe_cost=1.0, t_max=0)
+    with pytest.raises(UserError, match=r"cost: 'prices.csv', expected numbers"):
+        Task(2, cost="prices.csv")
+    for size in (2.0, None):
+        with pytest.raises(UserError, match=f"size={size}: expected an integer >= 1"):
+            Task(size, cost=0.1)  # type: ignore[arg-type]
     with pytest.raises(UserError, match=r"kernel: 9 rows, but a 2x2 grid has 4 cells"):
         World(np.eye(9), 2, cost=np.zeros(4), safe_cost=1.0, t_max=0)
 

@@ -39,7 +39,10 @@ def one_each(
     Raises:
         UserError: another number of numbers, or one out of range.
     """
-    values, rows = np.asarray(given, dtype=np.float64), ""
+    try:
+        values, rows = np.asarray(given, dtype=np.float64), ""
+    except (TypeError, ValueError):
+        raise UserError(f"{source}: {given!r:.40}, expected numbers") from None
     if isinstance(count, tuple):
         rows = f", or {count[0]} x {count[1]}"
         values = values.ravel() if values.shape == count else values

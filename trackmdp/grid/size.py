@@ -21,8 +21,8 @@ def grid_size(size: Size) -> tuple[int, int]:
     Raises:
         UserError: these are no whole numbers of at least 1.
     """
+    pair = tuple(size) if np.iterable(size) else (size, size)
     # np.integer is no int: a size may come out of an array's shape or of a file.
-    pair = (size, size) if isinstance(size, (int, np.integer)) else tuple(size)
     if len(pair) != 2 or not all(
         isinstance(side, (int, np.integer)) and side >= 1 for side in pair
     ):
