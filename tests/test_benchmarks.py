@@ -253,6 +253,7 @@ def test_the_worlds_are_as_their_names() -> None:
         np.testing.assert_allclose(kernel.sum(axis=1), 0.995)
 
 
+@pytest.mark.slow
 def test_regret_is_over_the_seeds_and_the_bracket_is_proved() -> None:
     typed = ("grid.size=4", "worlds=[walk c .4,Z 9 c .16]", "algos=model_based")
     both, first = (measure("regret", *typed, f"seeds={seeds}") for seeds in ("[0,1]", "[0]"))

@@ -148,6 +148,7 @@ def test_the_plugin_learns_by_its_name(tmp_path: Path) -> None:
     assert 0.9 * qmdp < learned <= upper
 
 
+@pytest.mark.slow
 def test_a_tracker_is_driven_by_a_file_of_detections(tmp_path: Path) -> None:
     """Cells of 10 x and y on 3 x 3, y up; the sensor of the last located cell alone is on, T_max 1."""
     place = Place((0.0, 0.0), 10.0)
@@ -178,6 +179,7 @@ def test_a_tracker_follows_a_vehicle_that_was_held_out() -> None:
     assert sensing < 20 * count
 
 
+@pytest.mark.slow
 def test_remembering_the_displacement_pays_on_the_ring() -> None:
     """A vehicle that is known to go round one way: no sensor is on behind it."""
     lines = example("memory")
