@@ -75,29 +75,26 @@ def read(items: Any) -> dict[str, Any]:
 
 
 def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Config, every row and the final figures; resumed, under the same id."""
+    """Config, every row, also those after the last frame, and the final figures; resumed, under the same id."""
     pytest.importorskip("wandb")
     words = ("log=[wandb]", "log.wandb.project=ours")
     with monkeypatch.context() as patch, pytest.raises(Killed):
         at_iteration(patch, 6, killed)
-        train(tmp_path, *words)
-    train(tmp_path, *words, "resume=auto")
+        train(tmp_path, *words, algo="hindsight")
+    train(tmp_path, *words, "resume=auto", algo="hindsight")
     first, second = offline(tmp_path)
     assert first["id"] == second["id"]
     assert first["project"] == "ours"
     assert {key: first["config"][key] for key in ("seed", "log")} == {
         key: to_dict(load_run_config(tmp_path))[key] for key in ("seed", "log")
     }
-    begun = [row["_step"] for row in first["rows"]]
-    assert begun == [256 * k for k in range(1, 6)]
-    table = {int(row["frames"]): row for row in rows(tmp_path)}
-    for row in second["rows"]:
-        assert (
-            row["aihtr"] == float(table[row["_step"]]["aihtr"])
-            if table[row["_step"]]["aihtr"]
-            else True
-        )
-    assert second["rows"][-1]["frames"] == max(table)
+    logged = [*first["rows"], *second["rows"]]
+    table = {int(row["iteration"]): row for row in rows(tmp_path)}
+    assert [row["iteration"] for row in first["rows"]] == list(range(1, 6))
+    assert [row["iteration"] for row in logged] == list(table) == list(range(1, 13))
+    for row in logged:
+        for key in ("frames", "aihtr"):
+            assert str(row.get(key, "")) == table[row["iteration"]][key]
     evaluation = load_run(tmp_path).evaluation
     assert second["summary"]["final/aihtr"] == evaluation.aihtr
     assert not any(key.startswith("final/") for key in first["summary"])
@@ -115,14 +112,18 @@ def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     "ignore::DeprecationWarning"
 )  # mlflow's database layer calls deprecated names
 def test_mlflow_in_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One run with the options as parameters, each row once although two processes logged it, and final figures."""
+    """One run with the options as parameters, each row once although two processes logged it, and final figures.
+
+    Iterations 9 to 12 are after the last frame.
+    """
     pytest.importorskip("mlflow")
     from mlflow import MlflowClient
 
+    words = ("log=[mlflow]", "checkpoint.every=512")
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        at_iteration(patch, 6, killed)
-        train(tmp_path, "log=[mlflow]")
-    train(tmp_path, "log=[mlflow]", "resume=auto")
+        at_iteration(patch, 11, killed)
+        train(tmp_path, *words, algo="hindsight")
+    train(tmp_path, *words, "resume=auto", algo="hindsight")
     client = MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
     experiment = client.get_experiment_by_name("trackmdp")
     (run,) = client.search_runs([experiment.experiment_id])

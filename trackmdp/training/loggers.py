@@ -287,10 +287,12 @@ class WandbLogger(_Tracker):
                 config=to_dict(trainer.config),
                 settings=quiet,
             )
+        # Its own step is the iteration: after the last frame there are more of these, which would be one row.
+        self._run.define_metric("*", step_metric="frames")
 
     def write(self, row: Row) -> None:
         """Log the row."""
-        self._run.log(known(row), step=int(row["frames"] or 0))
+        self._run.log(known(row), step=int(row["iteration"] or 0))
 
     def results(
         self,
@@ -303,7 +305,7 @@ class WandbLogger(_Tracker):
         import wandb
 
         images = {name: wandb.Image(picture) for name, picture in pictures.items()}
-        self._run.log(images, step=trainer.position.frames)
+        self._run.log(images, step=trainer.position.iteration)
         self._run.summary.update(dict(figures))
         artifact = wandb.Artifact(f"policy-{self._id}", type="model")
         artifact.add_file(str(policy))
@@ -323,7 +325,7 @@ class MlflowLogger(_Tracker):
 
     name = "mlflow"
     _cfg: MlflowConfig
-    _logged = -1  # frames of the last row that is there
+    _logged = 0  # iteration of the last row that is there
 
     def on_start(self, trainer: Training) -> None:
         """Begin the run, or go on with it.
@@ -348,8 +350,8 @@ class MlflowLogger(_Tracker):
                 self._begin(trainer)
             else:
                 self._client.update_run(self._id, status="RUNNING")
-                rows = self._client.get_metric_history(self._id, "frames")
-                self._logged = max((row.step for row in rows), default=-1)
+                rows = self._client.get_metric_history(self._id, "iteration")
+                self._logged = max((int(row.value) for row in rows), default=0)
 
     def _begin(self, trainer: Training) -> None:
         from mlflow.entities import Param
@@ -373,7 +375,7 @@ class MlflowLogger(_Tracker):
     def write(self, row: Row) -> None:
         """Log the row, unless it is there."""
         measured = known(row)
-        if measured["frames"] > self._logged:
+        if measured["iteration"] > self._logged:
             self._log(measured, int(measured["frames"]))
 
     def _log(self, row: Mapping[str, float], frames: int) -> None:
