@@ -36,6 +36,7 @@ def export(policy: Any, file: str | Path, *, value: Array | None = None, label: 
     Where the policy remembers more than the cell, the input `key` stands in place of `last_cell`; the metadata
     `key_start` and `key_next` are its formulas (`KeySpace.recipe`). Where the place of the grid is known, `crs`,
     `corner` and `cell_side` are it, and `cell_of` the formula of a cell of projected x and y (`Place.recipe`).
+    `absent` are the numbers of sensors that do not exist.
     `.json` holds the sets as lists (`PolicyTable.as_lists`), `.geojson` cells on a map (`trackmdp.policies.geojson`).
 
     Args:
@@ -68,6 +69,8 @@ def _facts(task: Task) -> dict[str, str]:
     facts = {"rows": str(task.rows), "columns": str(task.columns), "t_max": str(task.t_max)}
     if task.place is not None:
         facts |= task.place.recipe(task.size) | {"place": json.dumps(task.place.facts())}
+    if not task.available.all():
+        facts["absent"] = json.dumps(np.flatnonzero(~task.available).tolist())
     if task.coverage is not None:
         facts["footprints"] = json.dumps(task.coverage.as_lists())
     if task.keyed:
@@ -184,4 +187,5 @@ def _table(policy: PolicyTable) -> BoolArray:
         )
     sets = policy.dense()
     # Row t_max + 1 is all sensors on: the file's reader then needs no rule for the forced action.
-    return np.concatenate([sets, np.ones_like(sets[:, :1])], axis=1)
+    every = np.broadcast_to(task.available, sets[:, :1].shape)
+    return np.concatenate([sets, every], axis=1)

@@ -22,7 +22,7 @@ class OnnxTable:
         file: the model.
 
     Attributes:
-        task: size, limits, memory, footprints and place; prices are not in the file and stand as 0.
+        task: size, limits, sensors, memory, footprints and place; prices are not in the file and stand as 0.
 
     Raises:
         UserError: onnxruntime is not installed, or the file is missing, damaged or no exported policy.
@@ -73,4 +73,6 @@ def _task(about: dict[str, str], sensors: int) -> Task:
         more["coverage"] = ones_at(rows, columns, (sensors, size[0] * size[1]))
     if "place" in about:
         more["place"] = Place(**json.loads(about["place"]))
-    return Task(size, cost=np.zeros(sensors), t_max=int(about["t_max"]), **more)  # type: ignore[arg-type]
+    cost = np.zeros(sensors)
+    cost[json.loads(about.get("absent", "[]"))] = np.nan
+    return Task(size, cost=cost, t_max=int(about["t_max"]), **more)  # type: ignore[arg-type]

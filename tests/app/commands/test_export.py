@@ -16,6 +16,7 @@ import trackmdp as tm
 from tests.training.runs import train
 from trackmdp.app.cli import main
 from trackmdp.arrays.types import BoolArray
+from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import read_sets
 from trackmdp.training.run import trained
 
@@ -111,6 +112,24 @@ def test_with_a_memory_the_input_is_a_key_whose_formula_is_in_the_metadata(
     known |= {"cell": 6, "misses": 1}
     exec(about["key_next"], {"max": max, "min": min}, known)
     assert known["key"] == 69
+
+
+def test_the_safe_action_of_a_file_of_onnx_is_that_of_the_sensors_that_exist(
+    tmp_path: Path,
+) -> None:
+    onnxruntime, file = pytest.importorskip("onnxruntime"), tmp_path / "policy.onnx"
+    cost = np.full(9, 0.1)
+    cost[3] = np.nan
+    policy = Policy.none(tm.make_world("random_walk", size=3, t_max=0, cost=cost))
+    tm.export(policy, file)
+    missed = {"last_cell": np.array([0]), "steps_since_detection": np.array([1])}
+    (action,) = onnxruntime.InferenceSession(file).run(["action"], missed)
+    tracker = tm.Tracker(file, 0)
+    tracker.sensors()
+    tracker.report(None)
+    assert tracker.safe
+    assert tracker.sensors() == np.flatnonzero(action[0]).tolist() == [0, 1, 2, 4, 5, 6, 7, 8]
+    assert tm.Tracker.restore(policy, tracker.state()).sensors() == tracker.sensors()
 
 
 def test_sets_hold_the_formula_too(remembering: Path, tmp_path: Path) -> None:
