@@ -75,6 +75,27 @@ def test_it_is_cut_back_and_goes_on(
     assert (tmp_path / "cut/episodes.mcap").read_bytes() == (whole / "episodes.mcap").read_bytes()
 
 
+def test_a_kill_while_the_log_is_taken_over_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: Path
+) -> None:
+    cut(tmp_path / "cut", monkeypatch, closes=False)
+    add, taken = EpisodeWriter.add, list[Any]()
+
+    def fourth(self: EpisodeWriter, episode: Any) -> None:
+        taken.append(episode)
+        if len(taken) == 4:
+            self.abandon()
+            killed()
+        add(self, episode)
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(EpisodeWriter, "add", fourth)
+        train(tmp_path / "cut", *LOGGED, "resume=auto")
+    train(tmp_path / "cut", *LOGGED, "resume=auto")
+    assert [file.name for file in (tmp_path / "cut").glob("episodes*")] == ["episodes.mcap"]
+    assert (tmp_path / "cut/episodes.mcap").read_bytes() == (whole / "episodes.mcap").read_bytes()
+
+
 def test_it_begins_anew_where_nothing_is_saved_yet(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: Path
 ) -> None:

@@ -79,11 +79,12 @@ class EpisodeLog:
             return
         earlier = self.file.with_name(f"{self.file.name}.earlier")
         written = part if part.exists() else self.file
-        if not written.exists():
-            return
         # Moved aside, since the log that goes on takes its name; put back below if not all of the policies can be
-        # read.
-        written.replace(earlier)
+        # read. It lies there already where a process was killed amid this, whose `.part` is a copy of its beginning.
+        if not earlier.exists():
+            if not written.exists():
+                return
+            written.replace(earlier)
         taken = taken_over(earlier, self.file, policies)
         if taken is None:
             earlier.replace(written)
