@@ -19,9 +19,12 @@ from typing import Any
 import pytest
 import torch
 
+from tests.training.runs import train
 from trackmdp import durable
 from trackmdp.errors import UserError
 from trackmdp.training import checkpoint
+from trackmdp.training.folders import SUMMARY
+from trackmdp.training.run import load_run, trained
 
 
 def state(seed: int = 0, size: int = 2000) -> dict[str, Any]:
@@ -301,3 +304,21 @@ def test_a_name_given_twice_leaves_nothing_behind(tmp_path: Path) -> None:
     file = checkpoint.save(tmp_path, 1, state(1), keep=2, best=True)
     checkpoint.point(file, best=True)
     assert names(tmp_path) == ["best.pt", "iteration-00000001.pt", "last.pt"]
+
+
+@pytest.mark.parametrize("algo", ["hindsight", "dqn"])
+def test_a_run_of_another_kind_of_device_is_looked_at_here_and_not_resumed(
+    algo: str, tmp_path: Path
+) -> None:
+    """A generator's state has 16 bytes on a GPU, 5,056 on a CPU."""
+    train(tmp_path, algo=algo)
+    file = checkpoint.newest(tmp_path)
+    saved = checkpoint.load(file)
+    saved["algorithm"]["generator"] = torch.zeros(16, dtype=torch.uint8)
+    saved["versions"]["device"] = "cuda"
+    checkpoint.save(file.parent, saved.pop("iteration"), saved, keep=1)
+    policy = trained(str(tmp_path), torch.device("cpu"))[1]
+    assert (policy.sets != load_run(tmp_path).policy.sets).nnz == 0
+    (tmp_path / SUMMARY).unlink()
+    with pytest.raises(UserError, match="written with device cuda, this is cpu; expected the same"):
+        train(tmp_path, "resume=auto", "checkpoint.keep=1", algo=algo)

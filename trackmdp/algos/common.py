@@ -98,7 +98,10 @@ class Checkpointed:
         for name in self.parts:
             part, saved = getattr(self, name), state[name.strip("_")]
             if isinstance(part, torch.Generator):
-                part.set_state(saved.cpu())
+                # That of another kind of device has another length. A run resumes on the same kind; to look at what
+                # was learned no draws need to go on.
+                if len(saved) == len(part.get_state()):
+                    part.set_state(saved.cpu())
             elif isinstance(part, np.random.Generator):
                 part.bit_generator.state = json.loads(saved)
             elif hasattr(part, "load_state_dict"):

@@ -154,7 +154,14 @@ class _ZeroedStorage(LazyTensorStorage):
 class DQN(Checkpointed):
     """Learns off policy from a replay buffer; explores by flipping sensors; the target network is evaluated."""
 
-    parts: ClassVar[tuple[str, ...]] = ("loss", "optimizer", "buffer", "explore", "iteration")
+    parts: ClassVar[tuple[str, ...]] = (
+        "loss",
+        "optimizer",
+        "buffer",
+        "generator",
+        "explore",
+        "iteration",
+    )
 
     def __init__(
         self,
@@ -187,7 +194,8 @@ class DQN(Checkpointed):
             sampler=sampler,
             batch_size=cfg.batch_size,
         )
-        self.buffer.set_rng(generator(seed, "buffer", device=device))
+        self.generator = generator(seed, "buffer", device=device)
+        self.buffer.set_rng(self.generator)
 
     @property
     def actor(self) -> TensorDictModuleBase:
@@ -195,6 +203,13 @@ class DQN(Checkpointed):
         self.loss.target_qvalue_network_params.data.to_module(self.slow)
         flip = EpsilonFlip(0.0, budget=self.budget).to(self.explore.epsilon.device)
         return TensorDictSequential(self.slow, flip)
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Checkpointed`."""
+        state = super().state_dict()
+        # TorchRL makes it anew on the device that it was saved on, which need not be here; ours is saved by itself.
+        state["buffer"]["_rng"] = None
+        return state
 
     def step(self, batch: TensorDictBase | None) -> dict[str, float]:
         """Store one batch `[B, time]`, then update `updates` times."""

@@ -25,7 +25,8 @@ CHANGEABLE = (
     "collector.device",
     "quiet",
 )
-"""Options, or groups of them, that may differ on resume: budget, solving, logging, saving, workers and devices."""
+"""Options, or groups of them, that may differ on resume: budget, solving, logging, saving, workers, and devices of the
+same kind."""
 
 
 def run_folder(cfg: TrainConfig, chosen: Path, key: str = "hydra.run.dir") -> Path:

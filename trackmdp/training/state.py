@@ -19,6 +19,7 @@ from trackmdp.errors import Preempted, UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Position, Row, Training
+from trackmdp.training.devices import make_device
 from trackmdp.training.evaluator import Score
 from trackmdp.training.inputs import identity
 from trackmdp.untrusted import decoded
@@ -41,7 +42,7 @@ def capture(trainer: Training, folder: Path) -> dict[str, Any]:
     cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
     return {
         "identity": identity(trainer.config, folder, trainer.problem),
-        "versions": {name: version(name) for name in _EXACT},
+        "versions": _versions(trainer.config),
         "algorithm": trainer.algorithm.state_dict(),
         # None for collectors in worker processes: their environments cannot be saved and begin new episodes.
         "collector": {"environment": collector.env.snapshot()}
@@ -51,6 +52,13 @@ def capture(trainer: Training, folder: Path) -> dict[str, Any]:
         "position": vars(trainer.position),
         "callbacks": {each.name: each.state_dict() for each in trainer.callbacks if each.name},
     }
+
+
+def _versions(cfg: TrainConfig) -> dict[str, str]:
+    """Of all that draws and rounds: packages, and kinds of devices, whose generators differ."""
+    devices = {"device": cfg.device, "collector.device": cfg.collector.device}
+    kinds = {key: make_device(name, key).type for key, name in devices.items()}
+    return {name: version(name) for name in _EXACT} | kinds
 
 
 def restore(state: Mapping[str, Any], algorithm: Algorithm, collector: BaseCollector) -> Position:
@@ -157,10 +165,10 @@ def _check(state: Mapping[str, Any], cfg: TrainConfig, problem: Subject, file: P
     _check_identity(state, cfg, problem, file)
     with decoded(str(file), "the state of a run"):
         # Another version may draw or round otherwise: the run would go on, but not as the one that was interrupted.
-        for name in _EXACT:
-            if (written := state["versions"][name]) != version(name):
+        for name, here in _versions(cfg).items():
+            if (written := state["versions"][name]) != here:
                 raise UserError(
-                    f"{file}: written with {name} {written}, this is {version(name)}; expected the same"
+                    f"{file}: written with {name} {written}, this is {here}; expected the same"
                 )
         at = Position(**state["position"])
         # A negative or far position would end the run at once, as if it were done.
