@@ -88,6 +88,15 @@ def stop(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
     raise Preempted(number)
 
 
+def leave(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
+    """A handler for `handled`: it ends the process, which first takes away what is to go.
+
+    Raises:
+        SystemExit: always. Not `Preempted`, upon which a run saves its state: it may be amid an iteration.
+    """
+    raise SystemExit(128 + number)
+
+
 class Watch(ExitStack):
     """While entered, the end of one of a collector's worker processes interrupts the call that waits for it.
 

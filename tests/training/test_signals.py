@@ -2,10 +2,12 @@ from __future__ import annotations
 
 import signal
 import threading
+from pathlib import Path
 
 import pytest
 
-from trackmdp.signals import Signals
+from trackmdp.app.cli import main
+from trackmdp.signals import Signals, handled
 
 
 def test_the_first_signal_is_noted_and_a_later_one_acts_as_before(
@@ -49,3 +51,17 @@ def test_outside_the_main_thread_signals_are_not_touched() -> None:
     thread.start()
     thread.join()
     assert seen == [before]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1])
+def test_before_training_a_signal_leaves_no_folder(
+    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = "trackmdp.training.trainer.seed_global"
+    monkeypatch.setattr(place, lambda seed: signal.raise_signal(number))
+    folder = tmp_path / "a" / "b"
+    words = ["train", "grid.size=3", "quiet=true", f"hydra.run.dir={folder}"]
+    with handled(lambda *_: None, number), pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 128 + number
+    assert not folder.parent.exists()

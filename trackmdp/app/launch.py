@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -38,6 +39,7 @@ from trackmdp.config.registry import maker
 from trackmdp.config.resume import key_of
 from trackmdp.config.tree import build_config
 from trackmdp.errors import UserError, message_of
+from trackmdp.signals import handled, leave
 
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 _OF_SWEEPS = ("hydra.sweep", "hydra.launcher")
@@ -63,7 +65,8 @@ def launch(command: str, words: Sequence[str]) -> int:
             return 0
         if args.multirun or "hydra.mode=MULTIRUN" in args.overrides:
             return _sweep(compose)
-        return _run_once(compose)
+        with handled(leave, signal.SIGTERM, signal.SIGUSR1):
+            return _run_once(compose)
 
 
 def _run_once(compose: Composer) -> int:
