@@ -114,6 +114,19 @@ def test_a_safe_action_that_misses_is_repeated() -> None:
     assert abs(float(forced.float().mean()) - (1 - 0.4**3)) < 0.02
 
 
+def test_where_there_is_no_sensor_none_reports_although_it_is_switched_on() -> None:
+    cost = np.full(9, 0.1)
+    cost[3] = np.nan
+    env = TrackEnv(two_kinds(cost=cost), 200)
+    state = env.reset()
+    for _ in range(3):
+        forced = state["steps_since_detection"].amax(-1, keepdim=True) > 1
+        state = env.step(state.set("action", torch.ones(200, 9, dtype=torch.bool)))["next"]
+        there = (env.target == 3) & ~forced
+        assert there.any()
+        assert (state["steps_since_detection"][there] > 0).all()
+
+
 def test_episodes_are_cut_after_the_last_step_allowed() -> None:
     env = TrackEnv(two_kinds(max_steps=3, exit_probability=0.3), 500, seed=1)
     check_env_specs(env)

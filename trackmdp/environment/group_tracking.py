@@ -83,11 +83,12 @@ class GroupTracking(TargetBatch):
         # A target that enters is located, and counts from the next step on, as the start of an episode is no step.
         present, n = inside & state["present"], state["steps_since_detection"]
         forced = (n > self._t_max).any(-1, keepdim=True)
-        report = action.gather(1, cell) | forced
+        on = action & self._available
+        report = on.gather(1, cell) | forced
         if uniform is not None:
             report = report & (uniform.view(shape) < self._detection[forced.long(), cell])
         seen, any_left = report & present, present.any(-1, keepdim=True)
-        spent = self._costs.price_of(action & self._available).unsqueeze(-1)
+        spent = self._costs.price_of(on).unsqueeze(-1)
         spent = torch.where(forced, self._safe, spent) * any_left
         reward = self._reward * seen.sum(-1, keepdim=True) - spent
         # The last action comes first; after the safe action nothing is remembered.
