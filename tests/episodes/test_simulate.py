@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
+import trackmdp as tm
 from tests.episodes.logs import WORLD, policy, recorded
 from tests.helpers import hop_world, limited, random_kernel, small_world
 from tests.tracks import by_hand
@@ -20,6 +21,7 @@ from trackmdp.environment.dynamics import Dynamics
 from trackmdp.environment.env import TrackEnv
 from trackmdp.environment.paths import path_sampler
 from trackmdp.episodes.episode import Episode, first_difference
+from trackmdp.episodes.sentences import sentence
 from trackmdp.episodes.simulate import episode_seeds, resimulate, simulate
 from trackmdp.errors import UserError
 from trackmdp.policies import policy as policies
@@ -330,3 +332,12 @@ def test_all_steps_are_one_tensordict() -> None:
     mine = steps[steps["episode"] == 2].exclude("episode")
     assert (mine == episodes[2].to_tensordict(WORLD)).all()
     assert len(simulate(WORLD, "qmdp", 0).to_tensordict()) == 0
+
+
+def test_a_safe_action_that_misses_is_told_so() -> None:
+    world = tm.make_world("random_walk", size=3, t_max=0, safe_detection=0.3)
+    (episode,) = simulate(world, Policy.none(world), 1)
+    forced, inside = episode.misses > 0, episode.target < 9
+    for seen, word in ((True, "located"), (False, "missed")):
+        (t, *_) = np.flatnonzero(forced & inside & (episode.located == seen))
+        assert f": safe action forced, target {word} in row" in sentence(episode, t, world)

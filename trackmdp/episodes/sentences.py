@@ -52,9 +52,10 @@ def _found(episode: Recording, t: int, task: Task) -> str:
     if episode.target[t] == task.num_cells:
         return "the target has left the grid"
     mode, place = episode.mode, where(int(episode.target[t]), task.columns)
-    found = f"target {'detected' if episode.located[t] else 'missed'} in {place}"
+    seen = bool(episode.located[t])
+    found = f"target {'detected' if seen else 'missed'} in {place}"
     if episode.misses[t] > task.t_max:
-        found = f"safe action forced, target located in {place}"
+        found = f"safe action forced, target {'located' if seen else 'missed'} in {place}"
     if isinstance(task, World) and mode is not None:
         found += f" in {mode_words(task, int(mode[t]))}"
     return found
