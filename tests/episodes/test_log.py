@@ -5,16 +5,19 @@ from __future__ import annotations
 import json
 from base64 import b64decode
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
+import trackmdp as tm
 from tests.episodes.logs import CONFIG, WORLD, policy, recorded, rewritten, write
 from tests.episodes.test_simulate import WINDOWED
 from tests.tracks import by_hand, digest_of
 from tests.tracks import recorded as recorded_tracks
+from trackmdp.environment.env import TrackEnv
 from trackmdp.episodes import schema
 from trackmdp.episodes.episode import first_difference
 from trackmdp.episodes.episode_page import page
@@ -238,3 +241,27 @@ def test_a_log_along_recorded_tracks_comes_back(tmp_path: Path) -> None:
         found = reader.world()
         assert digest_of(found.held_out) == digest_of(found.tracks) == digest_of(setting.held_out)
     assert recover(file).file.read_bytes() == file.read_bytes()
+
+
+@pytest.mark.parametrize(
+    "options", [{"memory": "displacement"}, {"memory": "displacement_gap", "reveals": True}]
+)
+def test_an_episode_has_the_memory_that_the_environment_shows(options: dict[str, Any]) -> None:
+    world = tm.make_world("heading", size=3, t_max=1, **options)
+    episodes = tm.simulate(world, Policy.random_k(world, 3), 5)
+    mine = episodes.to_tensordict()
+    assert set(mine.keys(True, True)) - {"episode"} == set(
+        TrackEnv(world).rollout(1).keys(True, True)
+    )
+    assert np.array_equal(mine["key"], episodes.key)
+    going_on = ~mine["next", "done"][:-1, 0]
+    assert torch.equal(mine["next", "key"][:-1][going_on], mine["key"][1:][going_on])
+
+
+def test_an_episode_has_the_mask_of_the_sensors_that_exist() -> None:
+    cost = np.full(9, 0.1)
+    cost[3] = np.nan
+    mine = tm.simulate(world := tm.make_world("random_walk", size=3, cost=cost), "qmdp", 2)[0]
+    steps = mine.to_tensordict(world)
+    assert steps["action_mask"].tolist() == [(~np.isnan(cost)).tolist()] * len(mine)
+    assert (steps["next", "action_mask"] == steps["action_mask"]).all()

@@ -13,7 +13,9 @@ import torch
 from tensordict import TensorDict
 
 from trackmdp.arrays.types import AnyArray, Array, BoolArray, Indices
+from trackmdp.memory.keys import KeySpace
 from trackmdp.notebook.card import Card, Carded, Facts, decimal
+from trackmdp.sensing.actions import ActionMask
 from trackmdp.sensing.task import Task
 from trackmdp.sensing.windows import Window
 
@@ -167,7 +169,19 @@ class Episode(Recording):
             "steps_since_detection": misses,
             "action_history": _history(action, misses, self.located, task.t_max),
         }
+        if task.keyed:
+            states["key"] = self._keys(task.keys)
+        if (mask := ActionMask(task)).observed:
+            states["action_mask"] = mask(torch.from_numpy(self._last_cells)).numpy()
         return self._transitions(task, states, action)
+
+    def _keys(self, keys: KeySpace) -> Indices:
+        """`[T + 1]` the memory in each state."""
+        found = [np.int64(keys.start(self.start, self.start_mode))]
+        mode = 0 * self.target if self.mode is None else self.mode
+        for each in zip(self.located, self.misses, self.target, mode, strict=True):
+            found.append(keys.next(found[-1], *each[1:]) if each[0] else found[-1])
+        return np.array(found)
 
 
 def _history(action: BoolArray, misses: Indices, located: BoolArray, t_max: int) -> BoolArray:
