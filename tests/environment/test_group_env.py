@@ -125,6 +125,8 @@ def test_where_there_is_no_sensor_none_reports_although_it_is_switched_on() -> N
         there = (env.target == 3) & ~forced
         assert there.any()
         assert (state["steps_since_detection"][there] > 0).all()
+        # Nor is it remembered: a rule for several targets is valued by the sensors that are on.
+        assert not state["action_history"][..., 3].any()
 
 
 def test_episodes_are_cut_after_the_last_step_allowed() -> None:

@@ -92,7 +92,7 @@ class GroupTracking(TargetBatch):
         spent = torch.where(forced, self._safe, spent) * any_left
         reward = self._reward * seen.sum(-1, keepdim=True) - spent
         # The last action comes first; after the safe action nothing is remembered.
-        history = torch.cat([action.unsqueeze(1), state["action_history"][:, :-1]], 1)
+        history = torch.cat([on.unsqueeze(1), state["action_history"][:, :-1]], 1)
         seen, more = seen | (inside ^ present), (n + 1).clamp_max(self._t_max + 1)
         following = {
             "place": place,
