@@ -147,6 +147,24 @@ def test_a_model_of_stable_baselines_is_its_mode() -> None:
     assert tm.evaluate(WORLD, Model()).aihtr == tm.evaluate(WORLD, same).aihtr
 
 
+def test_a_model_of_stable_baselines_is_given_the_mask_and_refused_where_it_reads_more() -> None:
+    class Model:
+        def __init__(self, world: Any) -> None:
+            self.observation_space = SimpleNamespace(spaces=tm.TrackEnv(world).observation_spec)
+
+        def predict(self, seen: dict[str, Any], deterministic: bool) -> tuple[Any, None]:  # noqa: ARG002
+            return seen["action_mask"], None
+
+    cost = np.full(9, 0.1)
+    cost[3] = np.nan
+    world = tm.make_world("random_walk", size=3, cost=cost)
+    assert tm.evaluate(world, Model(world)).aihtr == tm.evaluate(world, "all_on").aihtr
+    limited = tm.make_world("random_walk", size=3, max_steps=5)
+    for call in (tm.evaluate, lambda *given: tm.simulate(*given, 1)):
+        with pytest.raises(UserError, match="policy: the model reads step_count, expected last_ce"):
+            call(limited, Model(limited))
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

@@ -20,7 +20,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type, set_exploratio
 from trackmdp.environment.observation import ObservationVector
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.sensing.actions import checked_action
+from trackmdp.sensing.actions import ActionMask, checked_action
 from trackmdp.sensing.task import Task
 
 STATE_KEYS = ("last_cell", "steps_since_detection", "action_history")
@@ -97,15 +97,26 @@ def adapted(task: Task | None, policy: Any) -> Any:
     if isinstance(held := getattr(policy, "policy", None), PolicyTable):
         return held
     if hasattr(policy, "predict") and hasattr(policy, "observation_space"):
-        return _predicted(policy)
+        return _predicted(task, policy)
     return policy
 
 
-def _predicted(model: Any) -> Callable[..., Any]:
-    """The mode of a model of Stable-Baselines3 as a function."""
+def _predicted(task: Task | None, model: Any) -> Callable[..., Any]:
+    """The mode of a model of Stable-Baselines3 as a function.
+
+    Raises:
+        UserError: it reads more than a function is given, and the mask.
+    """
+    known = (*STATE_KEYS, "action_mask")
+    if others := sorted({*getattr(model.observation_space, "spaces", known)} - {*known}):
+        raise UserError(
+            f"policy: the model reads {', '.join(others)}, expected {', '.join(known)} at most"
+        )
 
     def function(*state: Tensor) -> Any:
         seen = {key: value.numpy() for key, value in zip(STATE_KEYS, state, strict=True)}
+        if task is not None and (mask := ActionMask(task)).observed:
+            seen["action_mask"] = mask(state[0]).numpy()
         return model.predict(seen, deterministic=True)[0]
 
     return function
