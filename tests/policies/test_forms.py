@@ -152,7 +152,7 @@ def test_a_model_of_stable_baselines_is_given_the_mask_and_refused_where_it_read
         def __init__(self, world: Any) -> None:
             self.observation_space = SimpleNamespace(spaces=tm.TrackEnv(world).observation_spec)
 
-        def predict(self, seen: dict[str, Any], deterministic: bool) -> tuple[Any, None]:  # noqa: ARG002
+        def predict(self, seen: dict[str, Any], deterministic: bool) -> tuple[Any, None]:
             return seen["action_mask"], None
 
     cost = np.full(9, 0.1)
