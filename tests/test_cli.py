@@ -64,6 +64,10 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         ("train ~grid.size", "~grid.size: expected grid.size=value, without + or ~"),
         ("train size", "size: expected option=value"),
         ("train grid.size=[", "grid.size=[: expected option=value"),
+        (
+            "replay file=möß.mcap",
+            "file=möß.mcap: expected option=value (a value with commas or letters beyond a to z needs quotes: ",
+        ),
         ("train seed=0,1", "seed=0,1: expected one value; add -m"),
         ("train -m seed=range(10000000)", "seed=range(10000000): expected at most 100,000 values"),
         (

@@ -30,7 +30,7 @@ def parsed(word: str) -> Override:
         override = OverridesParser.create().parse_override(word)
     except (HydraException, ValueError) as error:  # ValueError: an integer of thousands of digits
         raise UserError(
-            f"{word}: expected option=value (a value with blanks or commas needs quotes)"
+            f"{word}: expected option=value (a value with commas or letters beyond a to z needs quotes: \"'...'\")"
         ) from error
     if isinstance(override.value(), Glob):
         raise UserError(f"{word}: expected the values themselves, separated by commas")
