@@ -77,6 +77,14 @@ def test_another_draw_of_the_kernel_is_another_world() -> None:
     assert found.worlds == ["Z=5, c=0.16, seed=1", "Z=5, c=0.16, seed=2"]
 
 
+def test_lists_of_prices_that_read_alike_are_worlds_of_their_own() -> None:
+    prices = ([0.1] * 9, [0.4] * 9, 0.16, 0.16 + 1e-9)
+    found = study([run(str(c), options={"cost.sensor": c}) for c in prices])
+    lists = ["Z=5, c=a list of 9", "Z=5, c=a list of 9 (2)"]
+    assert found.worlds == ["Z=5, c=0.16", "Z=5, c=0.16 (2)", *lists]
+    assert [group[0].name for group in found.groups.values()][2:] == [str(c) for c in prices[:2]]
+
+
 def test_kernels_without_support_size_are_named_by_their_name() -> None:
     found = study([run("a", "kernel=random_walk"), run("b", "kernel=drift")])
     assert [world.split(",")[0] for world in found.worlds] == ["drift", "random_walk"]

@@ -190,6 +190,10 @@ def test_runs_on_recordings_have_no_regret_and_held_out_figures_under_their_name
     made = build(found)
     drawn = [figure.table.name for figure in made.figures]
     assert drawn == ["aihtr-z-5", "accuracy-z-5", "sensors-per-step-z-5", "frontier-z-5"]
+    assert "out of sight" in made.html()
+    assert "grey line" not in made.html()  # no best policy is known, and none is drawn
+    solved = [replace(run, references={"best known": {"aihtr": 8.0}}) for run in found.runs]
+    assert "grey line" in build(replace(found, runs=solved)).html()
     table = next(table for table in made.tables if table.name == "outcome")
     heads = [column.label for column in table.columns]
     learned, reference = table.rows

@@ -183,6 +183,8 @@ def _labels(
 ) -> dict[str, str]:
     """Name of each run -> label of its world or method, in the order of the labels.
 
+    Options that differ, yet read alike, as two lists of prices do, are told apart by a number after the label.
+
     Args:
         runs: all runs.
         head: option with the name of the kernel or the algorithm, which begins a label.
@@ -197,7 +199,15 @@ def _labels(
         place = ORDER.index(name) if name in ORDER else len(ORDER)
         return place, name, [_sortable(found[run.name].get(key)) for key in keys]
 
-    return {run.name: _label(found[run.name], head, keys) for run in sorted(runs, key=order)}
+    made: dict[str, str] = {}
+    behind: dict[str, list[Any]] = {}  # label -> the different values that it stands for
+    for run in sorted(runs, key=order):
+        values = [found[run.name].get(key) for key in keys]
+        alike = behind.setdefault(label := _label(found[run.name], head, keys), [])
+        alike += [values] if values not in alike else []
+        place = alike.index(values)
+        made[run.name] = f"{label} ({place + 1})" if place else label
+    return made
 
 
 def _varied(settings: Sequence[Options], head: str) -> list[str]:

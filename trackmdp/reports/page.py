@@ -165,13 +165,15 @@ def _story(drawn: Sequence[Mapped]) -> list[Part]:
 
 
 def _prices(grouped: Study, threshold: float | None) -> list[Part]:
-    parts: list[Part] = [_prose("prices")]
+    parts: list[Part] = []
     for panel in figures.panels(grouped):
         drawn = (
             figures.against_price(grouped, panel, key, threshold) for key in figures.QUANTITIES
         )
         parts.append([*filter(None, (*drawn, tradeoffs.swept_figure(grouped, panel)))])
-    return parts if len(parts) > 1 else []
+    # None on recordings, where no optimum is known.
+    best = [_prose("best")] if "best known" in grouped.references() else []
+    return [_prose("prices"), *best, *parts] if parts else []
 
 
 def _learning(grouped: Study, threshold: float | None) -> list[Part]:
