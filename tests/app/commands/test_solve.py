@@ -19,6 +19,8 @@ from tests.solvers.worlds import paper_world
 from tests.typed import ENVIRONMENT
 from trackmdp import durable
 from trackmdp.app.cli import main
+from trackmdp.paper import theorems
+from trackmdp.paper.check import Check
 from trackmdp.policies import saved
 from trackmdp.solvers import bounds
 from trackmdp.solvers.evaluate import evaluate
@@ -112,6 +114,22 @@ def test_solve_verify(tmp_path: Path) -> None:
     assert main(words) == 0
     assert (tmp_path / "a" / "solution.json").exists()
     assert read(tmp_path / "a", "verification.json")["optimum"]["certified"]
+
+
+@pytest.mark.parametrize("words", ["verify", "solve verify=true"])
+def test_a_claim_that_fails_ends_with_status_1(
+    tmp_path: Path,
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    wrong = Check("Lemma 9", "1 = 2", 1.0).judged(0.1)
+    monkeypatch.setattr(theorems, "check_theorems", lambda *_: [wrong])
+    monkeypatch.setattr(theorems, "check_remarks", lambda _: [])
+    folder = tmp_path / "a"
+    assert main([*words.split(), "grid.size=3", "quiet=true", f"hydra.run.dir={folder}"]) == 1
+    assert ": of 1 claims 0 hold, 1 FAIL; " in capsys.readouterr().err
+    assert not read(folder, "verification.json")["checks"][0]["passed"]
 
 
 @pytest.mark.parametrize("command", ["solve", "verify"])

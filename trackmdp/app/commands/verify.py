@@ -11,7 +11,7 @@ from rich.table import Table
 
 from trackmdp.config import VerifyConfig
 from trackmdp.durable import write_json
-from trackmdp.errors import UserError
+from trackmdp.errors import RunError, UserError
 from trackmdp.paper import theorems
 from trackmdp.paper.check import Check, summarize_checks
 from trackmdp.solvers import hidden, optimal
@@ -24,7 +24,11 @@ NODES = 10_000_000
 
 
 def run(cfg: VerifyConfig, folder: Path, world: Problem) -> float:
-    """Write `verification.json` to `folder`; returns the number of claims that fail (0 is expected)."""
+    """Write `verification.json` to `folder`; returns the number of statements checked.
+
+    Raises:
+        RunError: a claim fails.
+    """
     console = make_console(cfg.quiet)
     if cfg.grid.max_steps is not None:
         raise UserError(
@@ -35,7 +39,7 @@ def run(cfg: VerifyConfig, folder: Path, world: Problem) -> float:
     with console.status("checking the paper's theorems"):
         checks = write_checks(known, cfg.tolerance, folder)
     show_checks(console, checks, folder)
-    return float(sum(not check.passed for check in checks))
+    return float(len(checks))
 
 
 def write_checks(world: World, tolerance: float, folder: Path) -> list[Check]:
@@ -65,7 +69,11 @@ def write_checks(world: World, tolerance: float, folder: Path) -> list[Check]:
 
 
 def show_checks(console: Console, checks: list[Check], folder: Path) -> None:
-    """The table of all checks, and how many claims hold."""
+    """The table of all checks, and how many claims hold.
+
+    Raises:
+        RunError: one fails.
+    """
     shown = Table(title="the paper's theorems", title_justify="left")
     shown.add_column("statement")
     shown.add_column("deviation")
@@ -77,4 +85,7 @@ def show_checks(console: Console, checks: list[Check], folder: Path) -> None:
         off = "–" if np.isneginf(check.deviation) else f"{check.deviation:.2g}"
         shown.add_row(f"{check.name}: {check.statement}{note}", off, check.verdict)
     console.print(shown)
-    console.print(f"{summarize_checks(checks)}; results in {folder}")
+    summary = f"{summarize_checks(checks)}; results in {folder}"
+    console.print(summary)
+    if not all(check.passed for check in checks):
+        raise RunError(summary)
