@@ -167,6 +167,7 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         ("evaluate run=. baseline=qmdp", "expected exactly one of"),
         ("evaluate run=nowhere grid.size=5", "grid.size=5: not together with run="),
         ("evaluate run=nowhere kernel=drift", "kernel=drift: not together with run="),
+        ("evaluate run=nowhere task.memory=cell", "task.memory=cell: not together with run="),
     ],
 )
 def test_mistakes_end_in_one_line(

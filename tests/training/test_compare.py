@@ -124,6 +124,15 @@ def test_the_command_compares_runs_and_baselines(
     )
 
 
+def test_a_run_with_the_name_of_a_baseline_is_not_replaced_by_it(empty_folder: Path) -> None:
+    tm.train(WORLD, "model_based", folder="none", **FEW)
+    words = ["run=none", "baseline=none", "hydra.run.dir=out", "quiet=true"]
+    assert main(["compare", *words]) == 0
+    first, second = json.loads((empty_folder / "out/comparison.json").read_text())["policies"]
+    assert (first["name"], second["name"]) == (str(empty_folder / "none"), "none")
+    assert first["figures"]["aihtr"] != second["figures"]["aihtr"]
+
+
 @pytest.mark.usefixtures("empty_folder")
 @pytest.mark.parametrize(
     ("words", "message"),
@@ -132,6 +141,9 @@ def test_the_command_compares_runs_and_baselines(
         (["baseline=qmdp", "baseline=qmpd"], "baseline=qmpd: expected one of"),
         (["run=x", "baseline=qmdp"], "run=/"),
         (["run=x", "run=y", "grid.size=4"], "grid.size=4: not together with run="),
+        (["run=x", "run=y", "task.memory=cell"], "task.memory=cell: not together with run="),
+        (["run=x", "run=x"], "expected at least two policies, run=FOLDER or baseline=NAME, got 1"),
+        (["baseline=qmdp", "baseline=sets"], "baseline=sets: expected one of qmdp, all_on, none,"),
     ],
 )
 def test_a_mistyped_comparison_is_one_line(

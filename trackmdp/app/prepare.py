@@ -163,7 +163,7 @@ def _runs(cfg: CommandConfig) -> list[str]:
 
 def _check_files(cfg: CommandConfig, folder: Path, words: Sequence[str]) -> None:
     if isinstance(cfg, config.CompareConfig):
-        count = len(cfg.runs or []) + len(cfg.baselines or [])
+        count = len({*(cfg.runs or []), *(cfg.baselines or [])})
         if count < 2:
             raise UserError(
                 f"expected at least two policies, run=FOLDER or baseline=NAME, got {count}"
@@ -176,7 +176,7 @@ def _check_files(cfg: CommandConfig, folder: Path, words: Sequence[str]) -> None
     if runs := _runs(cfg):
         # False alarms are for testing trained policies.
         believed = isinstance(getattr(cfg, "sensor", None), config.FalseAlarmConfig)
-        own = {"grid", "kernel", "cost"} | ({"sensor"} if not believed else set())
+        own = {"grid", "kernel", "cost", "task"} | ({"sensor"} if not believed else set())
         for word in words:
             if key_of(word).split(".")[0] in own:
                 raise UserError(

@@ -16,6 +16,7 @@ from trackmdp.config.options import (
     file_option,
     listed,
     option,
+    options,
     refuse,
     share_option,
 )
@@ -178,10 +179,13 @@ class CompareConfig(WorldConfig):
     )
 
     def check(self, key: str, root: Any) -> None:
-        """The baselines exist."""
+        """The baselines exist, and need no file, which cannot be named here."""
+        known = [
+            name for name, schema in GROUPS["baseline"].items() if "file" not in options(schema)
+        ]
         for name in self.baselines or []:
-            if name not in GROUPS["baseline"]:
-                raise refuse("baseline", name, f"one of {', '.join(GROUPS['baseline'])}")
+            if name not in known:
+                raise refuse("baseline", name, f"one of {', '.join(known)}")
 
 
 class SolveConfig(WorldConfig):

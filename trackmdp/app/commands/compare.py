@@ -32,7 +32,8 @@ def run(cfg: CompareConfig, folder: Path, problem: Subject) -> float:
         found = [(group_of(own, count), *rest) for own, *rest in found]
     if found:
         problem = found[0][0]
-    same = Counter(Path(each).name for each in cfg.runs or [])
+    # A run's folder may have the name of another's, or of a baseline; then its whole path is shown.
+    same = Counter([*(Path(each).name for each in cfg.runs or []), *(cfg.baselines or [])])
     for each, (own, policy, _) in zip(cfg.runs or [], found, strict=True):
         name = Path(each).name if same[Path(each).name] == 1 else each
         elsewhere = "" if _digest(own) == _digest(problem) else " (other problem)"
