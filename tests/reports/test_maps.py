@@ -25,7 +25,7 @@ def by_hand(
 ) -> Mapped:
     zeros = np.zeros(len(kernel))
     return Mapped(
-        *("w", "m", 0, size, averaged, sparse.csr_array(sets), zeros),
+        *("w", "m", "0", size, averaged, sparse.csr_array(sets), zeros),
         *(sparse.csr_array(kernel), zeros, np.full(len(kernel), np.nan)),
     )
 

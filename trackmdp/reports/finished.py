@@ -148,7 +148,7 @@ def read_map(place: Path, run: FinishedRun, world: str, method: str) -> Mapped |
         sets = averaged_sets(table, sets, key_visits(problem, table))
     kernel, bound, simple = _references_by_cell(problem)
     return Mapped(
-        *(world, method, run.seed, table.task.size),
+        *(world, method, str(run.seed), table.task.size),
         averaged=table.task.keyed,
         sets=sets.astype(np.float64),
         value=value,

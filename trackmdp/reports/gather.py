@@ -14,7 +14,7 @@ from trackmdp.errors import UserError
 from trackmdp.reports.finished import read_map, read_run
 from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.results import Anomaly, FinishedRun, Mapped, Results
-from trackmdp.training.folders import FAILED_FILE, PLAN, PLAN_BYTES, SUMMARY, run_of
+from trackmdp.training.folders import DONE, FAILED_FILE, PLAN, PLAN_BYTES, SUMMARY, run_of
 from trackmdp.untrusted import decoded, known_object, printable
 
 DRAWN = 2
@@ -48,7 +48,7 @@ def gather_runs(folder: Path) -> Results:
     anomalies += _other_versions(runs, summaries)
     grouped = study(runs)
     maps, unread = _maps(folder, grouped)
-    return Results(runs, maps, [*anomalies, *unread], _manifest(plan, summaries))
+    return Results(runs, maps, [*anomalies, *unread], _manifest(plan, runs, summaries))
 
 
 def planned(folder: Path) -> Mapping[str, Any] | None:
@@ -96,7 +96,9 @@ def _read(place: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]]:
         reason = known_object(place / FAILED_FILE).get("reason", "no reason given")
         raise UserError(f"failed: {reason}")
     if not (place / "config.yaml").is_file():
-        raise UserError("not started")
+        # Other commands leave files of their own.
+        begun = (place / DONE).is_file()
+        raise UserError("done, but not by train" if begun else "not started")
     # The summary is written last: without it the figures are not final.
     if not (place / SUMMARY).is_file():
         running = run_of(place).state == "running"
@@ -115,7 +117,7 @@ def _other_versions(
     counted = _counted(summary.get("versions") for summary in summaries)
     usual = counted[0] if counted else {}
     for run, summary in zip(runs, summaries, strict=True):
-        own = summary.get("versions") or {}
+        own = _mapping(summary.get("versions"))
         other = [
             f"{name} {own.get(name, 'unknown')}, most have {value}"
             for name, value in usual.items()
@@ -156,7 +158,9 @@ def _from_the_middle(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
 
 
 def _manifest(
-    plan: Mapping[str, Any] | None, summaries: Sequence[Mapping[str, Any]]
+    plan: Mapping[str, Any] | None,
+    runs: Sequence[FinishedRun],
+    summaries: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
     """Command, times, versions and machines of a sweep, without paths of the machine."""
     words = printable(str(plan.get("line", ""))).split() if plan else []
@@ -164,17 +168,21 @@ def _manifest(
     return {
         "line": " ".join(word for word in words if not word.startswith(folders)),
         "planned": len(plan["jobs"]) if plan else None,
-        "wall_seconds": sum(summary["wall_seconds"] for summary in summaries),
-        "cpu_seconds": sum(summary["cpu_seconds"] for summary in summaries),
+        "wall_seconds": sum(run.figure("wall_seconds") for run in runs),
+        "cpu_seconds": sum(run.figure("cpu_seconds") for run in runs),
         "versions": _counted(summary.get("versions") for summary in summaries),
         "machines": _counted(summary.get("machine") for summary in summaries),
     }
 
 
 def _counted(entries: Iterable[Any]) -> list[dict[str, Any]]:
-    """Different entries with their number of runs, the most frequent first."""
-    counts = Counter(json.dumps(entry, sort_keys=True) for entry in entries if entry)
+    """Different entries with their number of runs, the most frequent first; none that is no mapping."""
+    counts = Counter(json.dumps(entry, sort_keys=True) for entry in map(_mapping, entries) if entry)
     return [
-        {"runs": count, **json.loads(text)}
+        {**json.loads(text), "runs": count}
         for text, count in sorted(counts.items(), key=lambda each: (-each[1], each[0]))
     ]
+
+
+def _mapping(entry: Any) -> Mapping[str, Any]:
+    return entry if isinstance(entry, Mapping) else {}

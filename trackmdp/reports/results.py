@@ -79,14 +79,16 @@ def checked(run: FinishedRun) -> FinishedRun:
         printable(key): printable(value) if isinstance(value, str) else value
         for key, value in run.settings.items()
     }
-    names = {key: str(plain[key]) for key in ("algo.name", "kernel.name")}
+    named: dict[str, Any] = {key: str(plain[key]) for key in ("algo.name", "kernel.name")}
+    named |= {"seed": int(plain["seed"]), "grid.size": plain["grid.size"]}
     numbers = _numbers(run.figures)
     missing = [key for key in NEEDED if numbers[key] is None]
     if missing or not numbers["expected_length"]:  # regrets are per step
         raise ValueError(f"{missing or 'expected_length'}: expected a number above 0")
     others = {str(key): _numbers(each) for key, each in run.references.items()}
     points = [tuple(map(float, point)) for point in run.curve]
-    settings = plain | names | {"seed": int(plain["seed"])}
+    # As they are stored: YAML has dates and sets as well, and whole numbers of any length.
+    settings = json.loads(json.dumps(plain | named))
     return FinishedRun(run.name, settings, numbers, others, points)
 
 
@@ -109,7 +111,7 @@ class Mapped:
     Attributes:
         world: label of the world.
         method: label of the method.
-        seed: of the run.
+        seed: of the run, as text: it may be larger than the integers of an array.
         size: rows and columns of the grid, M = rows x columns.
         averaged: whether the policy remembers more than the cell: `sets` are then shares of the detections in a cell.
         sets: `[M (t_max + 1), M]`, row x (t_max + 1) + n: 1 for cells sensed at n misses after a detection in x.
@@ -121,7 +123,7 @@ class Mapped:
 
     world: str
     method: str
-    seed: int
+    seed: str
     size: tuple[int, int]
     averaged: bool
     sets: sparse.csr_array
@@ -198,7 +200,17 @@ def load_results(folder: Path) -> Results:
         runs = [checked(FinishedRun(**run)) for run in content["runs"]]
         maps = [_mapped(place, given) for place in range(content["maps"])]
         anomalies = [Anomaly(**each) for each in content["anomalies"]]
-        return Results(runs, maps, anomalies, dict(content["manifest"]))
+        return Results(runs, maps, anomalies, _manifest(content["manifest"]))
+
+
+def _manifest(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The manifest, of values of the kinds that `Results` names."""
+    times = {f"{kind}_seconds": float(given.get(f"{kind}_seconds", 0)) for kind in ("wall", "cpu")}
+    counted = {
+        key: [{**each, "runs": int(each["runs"])} for each in given.get(key, ())]
+        for key in ("versions", "machines")
+    }
+    return {**given, **times, **counted, "line": str(given.get("line") or "")}
 
 
 def _mapped(place: int, given: Mapping[str, Any]) -> Mapped:
