@@ -150,7 +150,10 @@ def test_short_tracks_are_dropped_and_all_is_counted() -> None:
         "steps in 2 tracks of fewer than 2 cells": 2,
         "steps kept": 3,
         "tracks kept": 1,
+        "rows that nearly all positions span": 1,  # of 10: y is 5 everywhere, x from 5 to 50
+        "columns that they span": 5,
     }
+    assert not any("span" in line for line in made(seen(*first))[1])  # none outside
     assert (
         said({"reports read": 1234, "steps": 0, "tracks kept": 2})
         == "1,234 reports read, 2 tracks kept"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -21,6 +22,8 @@ _WIDEST = 12.0
 
 _MOST = 2**27
 """Steps of all tracks together; times in milliseconds and a step in seconds would make thousands for each report."""
+
+_OUTSIDE = "steps outside of the grid"
 
 _PARTS = 50
 """Of a cell. A city is a tenth of a degree wide, its cells tens of metres; a continent tens, its cells kilometres."""
@@ -87,20 +90,29 @@ def to_tracks(
     }
     if not len(tracks):
         raise UserError(f"{source}: no track of at least {grid.shortest} cells; {said(report)}")
+    if counts[_OUTSIDE]:  # the grid.size that would do, where the default was forgotten
+        wide, high = (max(1, math.ceil(each / grid.cell)) for each in _extent(flat))
+        report |= {"rows that nearly all positions span": high, "columns that they span": wide}
     return tracks, report, place
 
 
 def _check_extent(flat: Positions, grid: Gridding, source: str) -> None:
     """Refuse positions that are all about one cell, as degrees in columns x and y are."""
-    wide, high = (
-        float(np.ptp(np.percentile(known, (1, 99)))) if len(known) else np.inf
-        for known in (column[np.isfinite(column)] for column in (flat.x, flat.y))
-    )
+    wide, high = _extent(flat)
     if 0 < max(wide, high) < grid.cell / _PARTS:  # 0: nothing moves
         raise UserError(
             f"{source}: nearly all positions lie within {wide:.3g} x {high:.3g}, far less than a cell "
             f"(grid.cell={grid.cell:g}); expected a smaller cell, or columns lat and lon for degrees"
         )
+
+
+def _extent(flat: Positions) -> tuple[float, float]:
+    """Width and height of nearly all positions, from the 1st to the 99th percentile; inf without any."""
+    known = [column[np.isfinite(column)] for column in (flat.x, flat.y)]
+    wide, high = (
+        float(np.ptp(np.percentile(column, (1, 99)))) if len(column) else np.inf for column in known
+    )
+    return wide, high
 
 
 def said(report: Mapping[str, int]) -> str:
@@ -227,7 +239,7 @@ def _cut(
         clock + within,
     )
     counts = {
-        "steps outside of the grid": int((~inside).sum()),
+        _OUTSIDE: int((~inside).sum()),
         f"steps in {counted_words(int((~kept).sum()), 'track')} of fewer than {grid.shortest} cells": int(
             lengths[~kept].sum()
         ),
