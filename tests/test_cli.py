@@ -167,6 +167,14 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         ("evaluate run=. baseline=qmdp", "expected exactly one of"),
         ("evaluate run=nowhere grid.size=5", "grid.size=5: not together with run="),
         ("evaluate run=nowhere kernel=drift", "kernel=drift: not together with run="),
+        ("train ++resume=auto", "resume=auto: expected hydra.run.dir=FOLDER beside it"),
+        ("report sweep=. every=3", "every=3: without effect with watch=false"),
+        (
+            "report sweep=. watch=true threshold=1",
+            "threshold=1: without effect with watch=true",
+        ),
+        ("replay file=x speed=2", "speed=2: without effect where no episode is played"),
+        ("replay file=x speed=2 episode=0 verify=true", "speed=2: without effect where no"),
         ("evaluate run=nowhere task.memory=cell", "task.memory=cell: not together with run="),
     ],
 )

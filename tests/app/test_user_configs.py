@@ -77,6 +77,12 @@ def test_a_config_folder_of_ones_own_adds_choices(
             "not a config",
         ),
         ("experiment/a", "- 1", "experiment=a", "expected a mapping"),
+        (
+            "experiment/a",
+            "hydra: {mode: MULTIRUN}",
+            "experiment=a",
+            "hydra.mode=MULTIRUN: expected -m",
+        ),
         ("experiment/a", "x: " + "y" * 2**24, "experiment=a", "expected at most 16,777,216"),
         ("algo/a", f"defaults: [hindsight]\nx: {EVIL}", "algo=a", "'x' not in"),
         (

@@ -191,6 +191,8 @@ def test_what_several_targets_cannot_do_is_refused(
     assert "2 targets that were learned together, expected a single" in capsys.readouterr().err
     assert main(["evaluate", f"run={tmp_path}", "targets.count=3"]) == 2
     assert "targets.count=3: expected 2, as the policy has" in capsys.readouterr().err
+    assert main(["evaluate", f"run={tmp_path}", "targets.count=1"]) == 2
+    assert "targets.count=1: expected at least 2, as the run has" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("algo", ["a2c", "dqn"])

@@ -17,7 +17,7 @@ from typing import Any
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.utils import configure_log, run_job
 from hydra.experimental.callback import Callback
-from hydra.types import HydraContext
+from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 
 from trackmdp import __version__
@@ -74,8 +74,10 @@ def _run_once(compose: Composer) -> int:
         if key_of(word).startswith(_OF_SWEEPS):
             raise UserError(f"{word}: without effect on a single run, expected -m beside it")
     cfg = compose(compose.words)
+    if cfg.hydra.mode is RunMode.MULTIRUN:  # in a file, as an experiment of the user's
+        raise UserError("hydra.mode=MULTIRUN: expected -m on the command line")
     # The default folder has the time in its name: no run would ever be resumed.
-    if "resume=auto" in compose.words and "${now:" in str(OmegaConf.to_container(cfg.hydra.run)):
+    if cfg.get("resume") == "auto" and "${now:" in str(OmegaConf.to_container(cfg.hydra.run)):
         raise UserError("resume=auto: expected hydra.run.dir=FOLDER beside it, the run's own")
     # All checks come first, so that a mistyped line leaves no folder behind.
     ready = prepare(compose.command, cfg, run_words(compose.words))

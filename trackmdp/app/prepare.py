@@ -183,7 +183,12 @@ def _check_files(cfg: CommandConfig, folder: Path, words: Sequence[str]) -> None
                     f"{word}: not together with run={','.join(runs)}: its own world is used"
                 )
         for run in runs:
-            load_run_config(run)
+            learned = load_run_config(run).targets.count
+            typed = by_key(words).get("targets.count")
+            if typed and isinstance(cfg, config.EvaluateConfig) and cfg.targets.count < learned:
+                raise UserError(
+                    f"targets.count={typed}: expected at least {learned}, as the run has"
+                )
     elif isinstance(cfg, config.ExportConfig):
         load_run_config(cfg.run)
     elif isinstance(cfg, config.ReportConfig):

@@ -258,6 +258,12 @@ class ReplayConfig(CommandConfig):
     layout: str | None = file_option("write the layout for viewers", "a file to write")
     speed: float = option("speed of playing", unit="steps/s", gt=0, le=1000)
 
+    def ignored(self, root: Any) -> dict[str, str]:
+        """An episode is played where nothing else is asked for."""
+        others = (self.html, self.csv, self.layout, self.verify, self.recover)
+        played = self.episode is not None and not any(others)
+        return {} if played else {"speed": "where no episode is played, which episode=N alone does"}
+
 
 class ReportConfig(CommandConfig):
     """Make figures, tables and one web page of a sweep, or watch it run."""
@@ -275,6 +281,11 @@ class ReportConfig(CommandConfig):
     every: float = option(
         "seconds from one look at the runs to the next, with watch=true", unit="s", gt=0, le=3600
     )
+
+    def ignored(self, root: Any) -> dict[str, str]:
+        """A watch looks again and again, and makes no report."""
+        names = ("paper", "threshold") if self.watch else ("every",)
+        return dict.fromkeys(names, f"with watch={str(self.watch).lower()}")
 
 
 class ExportConfig(CommandConfig):

@@ -58,6 +58,14 @@ def test_a_report_holds_page_figures_tables_and_what_it_was_made_from(
     assert len(run_folders(sweep, None)) == 12  # the report that lies there is no run
 
 
+def test_sweeps_are_reported_one_by_one(sweep: Path) -> None:
+    line = ["report", "-m", f"sweep={sweep},{sweep}/report", "quiet=true", "hydra.sweep.dir=all"]
+    assert main(["report", f"sweep={sweep}", "quiet=true"]) == 0
+    assert main(line) == 0
+    first, second = (page.read_bytes() for page in Path("all").glob("*/report.html"))
+    assert first == second == (sweep / "report/report.html").read_bytes()
+
+
 def test_one_report_at_a_time_is_written_to_a_folder(
     sweep: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -255,6 +255,12 @@ def test_another_command_has_its_value_in_the_table(here: Path) -> None:
     assert [float(row["aihtr"]) for row in table(here / "all")] == [each["aihtr"] for each in exact]
 
 
+def test_a_command_without_a_value_has_none_in_the_table(here: Path) -> None:
+    line = ["compare", "-m", "baselines=[qmdp,none]", "quiet=true", "hydra.sweep.dir=all"]
+    assert main([*line, "grid.size=3,4"]) == 0
+    assert [(row["state"], row["aihtr"]) for row in table(here / "all")] == [("done", "")] * 2
+
+
 def test_states_of_a_run(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     assert run_of(folder).state == "waiting"

@@ -18,8 +18,8 @@ from trackmdp.world.group import Group, Subject, group_of
 from trackmdp.world.problem_file import problem_digest
 
 
-def run(cfg: CompareConfig, folder: Path, problem: Subject) -> float:
-    """Write `comparison.json`, and print the table and its conclusion; returns the number of policies.
+def run(cfg: CompareConfig, folder: Path, problem: Subject) -> None:
+    """Write `comparison.json`, and print the table and its conclusion.
 
     The problem is the first run's; without one, `cfg`'s. Where a run learned for several targets, all policies are
     compared for as many.
@@ -49,7 +49,6 @@ def run(cfg: CompareConfig, folder: Path, problem: Subject) -> float:
     for sentence in compared.sentences:
         console.print(sentence)
     console.print(f"results in {folder}")
-    return float(len(rows))
 
 
 def _digest(problem: Subject) -> str:

@@ -20,8 +20,8 @@ _MOST_ROWS = 20
 """Corners shown at the terminal; the files have all."""
 
 
-def run(cfg: FrontierConfig, folder: Path, world: Problem) -> float:
-    """Write `frontier.csv`, `frontier.json` and the sets of each corner to `folder`; returns the number of corners.
+def run(cfg: FrontierConfig, folder: Path, world: Problem) -> None:
+    """Write `frontier.csv`, `frontier.json` and the sets of each corner to `folder`.
 
     Where matplotlib is installed, also a figure, `frontier.svg` and `frontier.png`.
 
@@ -47,7 +47,6 @@ def run(cfg: FrontierConfig, folder: Path, world: Problem) -> float:
     _draw(folder, found, answers)
     for name, mixture in answers.items():
         show_mixture(console, f"{name}={given[name]:g}", mixture, found)
-    return float(len(found.corners))
 
 
 def write_corners(folder: Path, found: Tradeoff) -> None:

@@ -27,15 +27,16 @@ _WAIT = 600.0
 """Seconds that a report waits for another one in its folder."""
 
 
-def run(cfg: ReportConfig, folder: Path) -> float:
-    """Write the report to `folder`, or watch the sweep; returns the number of finished runs.
+def run(cfg: ReportConfig, folder: Path) -> None:
+    """Write the report to `folder`, or watch the sweep.
 
     Raises:
         UserError: there is no sweep to report on, or matplotlib is not installed.
     """
     sweep, console = Path(cfg.sweep), make_console(cfg.quiet)
     if cfg.watch:
-        return float(watch.watch(sweep, console, cfg.every))
+        watch.watch(sweep, console, cfg.every)
+        return
     require("matplotlib", "report", "report")
     # Its files belong together: of several reports at once in one folder, each waits for its turn.
     with locked(folder, wait=_WAIT), console.status("reading runs") as status:
@@ -53,7 +54,6 @@ def run(cfg: ReportConfig, folder: Path) -> float:
             folder,
         )
     _tell(console, found, folder)
-    return float(len(found.runs))
 
 
 def _about_the_paper(
