@@ -92,5 +92,5 @@ def test_runs_of_another_command_are_not_called_not_started(tmp_path: Path) -> N
     (tmp_path / "b").mkdir()
     (tmp_path / "b/done.json").write_text('{"value": 1.0}')
     jobs = [{"folder": name, "overrides": []} for name in "ab"]
-    (tmp_path / "sweep.json").write_text(json.dumps({"jobs": jobs, "line": "", "command": "x"}))
+    (tmp_path / "sweep.json").write_text(json.dumps({"jobs": jobs, "line": "a 'b", "command": "x"}))
     assert [each.text for each in gather_runs(tmp_path).anomalies] == ["done, but not by train"]

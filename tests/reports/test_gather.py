@@ -53,7 +53,7 @@ def reasons(found: Results) -> dict[str, str]:
 
 def plan(folder: Path, *names: object) -> None:
     jobs = [{"folder": name, "overrides": []} for name in names]
-    line = "trackmdp train -m hydra.sweep.dir=/x"
+    line = "trackmdp train -m 'hydra.sweep.dir=/x y'"
     write_json(folder / "sweep.json", {"command": "train", "line": line, "jobs": jobs})
 
 

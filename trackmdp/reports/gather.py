@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -163,10 +165,12 @@ def _manifest(
     summaries: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
     """Command, times, versions and machines of a sweep, without paths of the machine."""
-    words = printable(str(plan.get("line", ""))).split() if plan else []
+    words: list[str] = []
+    with suppress(ValueError):  # a line that no sweep wrote: quotes without an end
+        words = shlex.split(printable(str(plan.get("line", "")))) if plan else []
     folders = ("hydra.sweep.dir=", "hydra.run.dir=")
     return {
-        "line": " ".join(word for word in words if not word.startswith(folders)),
+        "line": shlex.join(word for word in words if not word.startswith(folders)),
         "planned": len(plan["jobs"]) if plan else None,
         "wall_seconds": sum(run.figure("wall_seconds") for run in runs),
         "cpu_seconds": sum(run.figure("cpu_seconds") for run in runs),

@@ -268,6 +268,8 @@ def _values(override: Override) -> list[str]:
         ]
     except ValueError as error:  # range(0,1,0)
         raise UserError(f"{override.input_line}: {error}") from error
+    if not values:  # range(3,0)
+        raise UserError(f"{override.input_line}: no value, expected at least one")
     if len(values) > MOST:
         raise UserError(f"{override.input_line}: expected at most {MOST:,} values")
     return values
