@@ -167,6 +167,14 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         ("evaluate run=. baseline=qmdp", "expected exactly one of"),
         ("evaluate run=nowhere grid.size=5", "grid.size=5: not together with run="),
         ("evaluate run=nowhere kernel=drift", "kernel=drift: not together with run="),
+        (
+            "train log.mcap.episodes=3",
+            "log.mcap.episodes: an option of another choice, expected log=mcap beside it",
+        ),
+        (
+            "train algo=ppo algo.ppo.epochs=3",
+            "algo.ppo.epochs: unknown option, did you mean algo.epochs?",
+        ),
         ("train ++resume=auto", "resume=auto: expected hydra.run.dir=FOLDER beside it"),
         ("report sweep=. every=3", "every=3: without effect with watch=false"),
         (

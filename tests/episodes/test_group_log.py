@@ -322,6 +322,9 @@ def test_commands_log_and_replay_several_targets(
     assert row["n"] == "0 0"
     layout = json.loads((tmp_path / "a" / "episodes.layout.json").read_text(encoding="utf-8"))
     assert "/belief/1" in layout["configById"]["3D!belief"]["topics"]
+    words = ["evaluate", "baseline=playback", f"baseline.file={file}", "grid.size=3"]
+    assert main([*words, f"hydra.run.dir={tmp_path / 'c'}"]) == 2
+    assert f"baseline.file={file}: of several targets, expected one" in capsys.readouterr().err
 
 
 def test_a_safe_action_that_misses_is_logged_and_found_again(tmp_path: Path) -> None:

@@ -47,9 +47,15 @@ def unknown_option(key: str, known: Mapping[str, Option]) -> UserError:
     """The refusal of a dotted key that does not exist, with the names beside it."""
     if key in RENAMED:
         return UserError(f"{key}: renamed, expected {RENAMED[key]}")
-    # `algo.epochs` without algo=ppo is no misspelling.
+    # `algo.epochs` without algo=ppo is no misspelling, and no more is `log.mcap.episodes` without log=[mcap].
     group, _, name = key.partition(".")
-    others = [each for each, schema in GROUPS.get(group, {}).items() if name in options(schema)]
+    choice, _, own = name.partition(".")
+    beneath = choice if f"{group}.{own}" not in known else None
+    others = [
+        each
+        for each, schema in GROUPS.get(group, {}).items()
+        if name in options(schema) or (each == beneath and own in options(schema))
+    ]
     if others:
         choices = " or ".join(f"{group}={each}" for each in others)
         return UserError(f"{key}: an option of another choice, expected {choices} beside it")

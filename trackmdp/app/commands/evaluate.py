@@ -207,6 +207,8 @@ def _played_back(
         if reader.run.size != world.size:
             recorded = f"baseline.file={chosen.file}: recorded on {grid_words(reader.run.size)}"
             raise UserError(f"{recorded}, expected grid.size of {grid_words(world.size)}")
+        if reader.run.kinds:
+            raise UserError(f"baseline.file={chosen.file}: of several targets, expected one")
         logged = reader.read(chosen.episode)
     actions = Playback(world, logged.action)
     # The logged episode's own seed gives its own target again, so that both returns agree where nothing has changed
