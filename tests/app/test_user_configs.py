@@ -32,6 +32,8 @@ def test_a_config_folder_of_ones_own_adds_choices(
     assert main(["train", "--config-dir", "../mine", "kernel=slow", "hydra.run.dir=../out"]) == 0
     assert (calls[0].kernel.name, calls[0].kernel.stay) == ("random_walk", 0.9)
     capsys.readouterr()
+    said = refused(capsys, "train", "--config-dir", "../mine", "kernel=slow", "--help")
+    assert said.endswith("; --cfg job shows a choice of --config-dir")
     assert "stai" in refused(capsys, "train", "--config-dir", "../mine", "kernel=typo")
     (tmp_path / "mine/algo").mkdir()
     (tmp_path / "mine/algo/bare.yaml").write_text("defaults: [base_ppo]\ngamma: 0.9\n")

@@ -134,7 +134,14 @@ def _run(command: str, words: list[str]) -> int:
     if "-h" in words or "--help" in words:
         from trackmdp.app.manual import manual
 
-        sys.stdout.write(manual(command, [word for word in words if not word.startswith("-")]))
+        try:
+            text = manual(command, [word for word in words if not word.startswith("-")])
+        except UserError as error:
+            if not any(word.startswith(("--config-dir", "-cd")) for word in words):
+                raise
+            # Read by Hydra alone, which help does without.
+            raise UserError(f"{error}; --cfg job shows a choice of --config-dir") from error
+        sys.stdout.write(text)
         return 0
     with importing():
         from trackmdp.app.launch import launch
