@@ -167,6 +167,8 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         ("evaluate run=. baseline=qmdp", "expected exactly one of"),
         ("evaluate run=nowhere grid.size=5", "grid.size=5: not together with run="),
         ("evaluate run=nowhere kernel=drift", "kernel=drift: not together with run="),
+        ("train baseline.k=3", "baseline.k=3: train has no baseline"),
+        ("solve algo=ppo", "algo=ppo: solve has no algo"),
         (
             "train log.mcap.episodes=3",
             "log.mcap.episodes: an option of another choice, expected log=mcap beside it",

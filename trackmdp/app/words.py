@@ -107,6 +107,7 @@ def _refuse_wrong(error: Exception, command: str, words: Sequence[str], compose:
         key, value = override.key_or_group, override.value()
         if override.is_add() and isinstance(value, str) and "Multiple values" in str(error):
             raise UserError(f"{override.input_line}: in the config already, expected {key}={value}")
+    _check_groups(overrides, command)
     # An experiment, a launcher or a sweeper: exactly one, by the name of a file.
     named = ("hydra/", "experiment") if command == "train" else "hydra/"
     files = [override for override in overrides if override.key_or_group.startswith(named)]
@@ -130,6 +131,15 @@ def _refuse_wrong(error: Exception, command: str, words: Sequence[str], compose:
         for override in overrides:
             if override not in [*files, *groups]:
                 _check_value(override, known)
+
+
+def _check_groups(overrides: Sequence[Override], command: str) -> None:
+    """Refuse a word of a group that the command does not have, before the choice that it belongs to is asked for."""
+    for override in overrides:
+        group = override.key_or_group.partition(".")[0]
+        of_others = GROUPS.keys() - options(ROOTS[command])
+        if group in of_others and not group.startswith("hydra/"):  # which all commands have
+            raise UserError(f"{override.input_line}: {command} has no {group}")
 
 
 def _check_choice(override: Override, message: str) -> None:
