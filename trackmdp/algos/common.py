@@ -225,8 +225,10 @@ def clipped_step(
     # The moments of what no batch touches sink below 1e-38, where processors take five times as long; beside Adam's
     # epsilon, 1e-8, they are nothing.
     torch.set_flush_denormal(True)
-    optimizer.step()
-    torch.set_flush_denormal(False)
+    try:
+        optimizer.step()
+    finally:  # it is the whole thread's, also where Ctrl-C ends the step
+        torch.set_flush_denormal(False)
     return norm
 
 

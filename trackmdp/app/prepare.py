@@ -182,9 +182,9 @@ def _check_files(cfg: CommandConfig, folder: Path, words: Sequence[str]) -> None
                 raise UserError(
                     f"{word}: not together with run={','.join(runs)}: its own world is used"
                 )
+        typed = by_key(words).get("targets.count")
         for run in runs:
             learned = load_run_config(run).targets.count
-            typed = by_key(words).get("targets.count")
             if typed and isinstance(cfg, config.EvaluateConfig) and cfg.targets.count < learned:
                 raise UserError(
                     f"targets.count={typed}: expected at least {learned}, as the run has"

@@ -135,9 +135,9 @@ def _refuse_wrong(error: Exception, command: str, words: Sequence[str], compose:
 
 def _check_groups(overrides: Sequence[Override], command: str) -> None:
     """Refuse a word of a group that the command does not have, before the choice that it belongs to is asked for."""
+    of_others = GROUPS.keys() - options(ROOTS[command])
     for override in overrides:
         group = override.key_or_group.partition(".")[0]
-        of_others = GROUPS.keys() - options(ROOTS[command])
         if group in of_others and not group.startswith("hydra/"):  # which all commands have
             raise UserError(f"{override.input_line}: {command} has no {group}")
 

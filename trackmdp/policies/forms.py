@@ -113,9 +113,11 @@ def _predicted(task: Task | None, model: Any) -> Callable[..., Any]:
             f"policy: the model reads {', '.join(others)}, expected {', '.join(known)} at most"
         )
 
+    mask = None if task is None else ActionMask(task)
+
     def function(*state: Tensor) -> Any:
         seen = {key: value.numpy() for key, value in zip(STATE_KEYS, state, strict=True)}
-        if task is not None and (mask := ActionMask(task)).observed:
+        if mask is not None and mask.observed:
             seen["action_mask"] = mask(state[0]).numpy()
         return model.predict(seen, deterministic=True)[0]
 

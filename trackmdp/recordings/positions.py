@@ -188,7 +188,7 @@ def frame_positions(frame: Any, own: Sequence[str] = ()) -> Positions:
         ValueError: a column is missing, or holds something else.
     """
     frame = frame.rename(columns=str)  # numbers, where a file had no line of names
-    columns = _chosen_columns(map(str, frame.columns), own)
+    columns = _chosen_columns(frame.columns, own)
     return table_of(*(frame[name] for name in columns.values()), geographic="lon" in columns)
 
 

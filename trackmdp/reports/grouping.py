@@ -204,7 +204,8 @@ def _labels(
     for run in sorted(runs, key=order):
         values = [found[run.name].get(key) for key in keys]
         alike = behind.setdefault(label := _label(found[run.name], head, keys), [])
-        alike += [values] if values not in alike else []
+        if values not in alike:
+            alike.append(values)
         place = alike.index(values)
         made[run.name] = f"{label} ({place + 1})" if place else label
     return made

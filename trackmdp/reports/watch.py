@@ -59,8 +59,8 @@ class Status:
         return [printable(self.name), printable(f"{self.state}{reason}"), share, gap, left]
 
 
-def watch(sweep: Path, console: Console, every: float) -> int:
-    """Show the runs until none is left to wait for; returns the number of finished ones.
+def watch(sweep: Path, console: Console, every: float) -> None:
+    """Show the runs until none is left to wait for.
 
     At a terminal a table stays in place; piped, each change of a state is a line.
 
@@ -85,7 +85,6 @@ def watch(sweep: Path, console: Console, every: float) -> int:
                     name, *rest = status.cells
                     console.print(f"{name}: {', '.join(filter(None, rest))}")
         console.print(_counts(found))
-    return sum(status.state == "done" for status in found)
 
 
 def statuses(sweep: Path) -> list[Status]:
