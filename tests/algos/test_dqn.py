@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
 from tests.helpers import algorithm, collect, small_world
@@ -32,9 +33,7 @@ def test_the_target_is_chosen_online_and_valued_by_the_target_network() -> None:
     rows, online, target = transitions(), random_network(), random_network()
     loss = AdditiveDQNLoss(online)
     SoftUpdate(loss, tau=0.5)  # without one, TorchRL warns
-    loss.target_qvalue_network_params.data.update_(
-        {("module", *key.split(".")): value for key, value in target.module.state_dict().items()}
-    )
+    loss.target_qvalue_network_params.data.update_(TensorDict.from_module(target).data)
     with torch.no_grad():
         following = rows["next"].select(*KEYS)
         best = online(following.clone())["sensor_value"] > 0

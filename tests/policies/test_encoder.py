@@ -36,12 +36,7 @@ def test_it_is_a_linear_layer_on_one_hots(t_max: int) -> None:
         encoder.history.bias.normal_()
     rows = random_state(world, 60, seed=1)
     inputs = [rows[key] for key in ("last_cell", "steps_since_detection", "action_history")]
-    tables = [encoder.cell, encoder.stage, encoder.cell_and_stage]
-    weight = (
-        torch.cat([*(table.weight.T for table in tables), encoder.history.weight], dim=1)
-        .detach()
-        .requires_grad_()
-    )
+    weight = torch.cat([encoder.table.T, encoder.history.weight], dim=1).detach().requires_grad_()
     bias = encoder.history.bias.detach().clone().requires_grad_()
     dense = torch.relu(features(world, *inputs) @ weight.T + bias)
     ours = encoder(*inputs)
@@ -49,7 +44,8 @@ def test_it_is_a_linear_layer_on_one_hots(t_max: int) -> None:
     probe = torch.randn(60, 8, dtype=torch.float64)
     (ours * probe).sum().backward()
     (dense * probe).sum().backward()
-    gradients = [*(table.weight.grad.T for table in tables), encoder.history.weight.grad]
+    assert encoder.table.grad is not None
+    gradients = [encoder.table.grad.T, encoder.history.weight.grad]
     torch.testing.assert_close(torch.cat(gradients, dim=1), weight.grad)
     torch.testing.assert_close(encoder.history.bias.grad, bias.grad)
 
@@ -68,10 +64,13 @@ def test_a_key_adds_what_it_shares_and_its_own(known: dict[str, Any]) -> None:
         keys,
     )
     before = encoder(*state)
-    shared, own = encoder.known
-    for table, moved in ((shared, keys % classes == 5), (own, keys == 4 * classes + 5)):
+    known = encoder.parts()
+    for name, row, moved in (
+        ("known.0", 5, keys % classes == 5),
+        ("known.1", 4 * classes + 5, keys == 4 * classes + 5),
+    ):
         with torch.no_grad():
-            table.weight[(5 if table is shared else 4 * classes + 5) * encoder.stages + 1] += 100.0
+            known[name][row * encoder.stages + 1] += 100.0
         after = encoder(*state)
         assert torch.equal((after != before).any(-1), moved)
         before = after
@@ -79,6 +78,24 @@ def test_a_key_adds_what_it_shares_and_its_own(known: dict[str, Any]) -> None:
         bias.table[5 * encoder.stages + 1] = 1.0
     assert torch.equal(bias(state[0], state[1], keys).all(-1), keys % classes == 5)
     assert not bias(state[0], state[1] + 1, keys).any()
+
+
+def test_a_state_dict_names_the_parts_and_is_loaded_again() -> None:
+    encoder, other = (StateEncoder(small_world(t_max=1).task, 8) for _ in range(2))
+    saved = encoder.state_dict()
+    shapes = {name: list(part.shape) for name, part in saved.items()}
+    assert shapes == {
+        "cell": [9, 8],
+        "stage": [3, 8],
+        "cell_and_stage": [27, 8],
+        "history.weight": [8, 18],
+        "history.bias": [8],
+    }
+    assert torch.equal(saved["stage"], encoder.table[9:12])
+    assert other.load_state_dict(saved) == ([], [])
+    assert torch.equal(other.table, encoder.table)
+    with pytest.raises(RuntimeError, match=r'Missing key.*"table"'):
+        other.load_state_dict({name: part for name, part in saved.items() if name != "stage"})
 
 
 def test_batches_of_any_shape_and_rows_alone() -> None:

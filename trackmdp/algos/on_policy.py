@@ -81,9 +81,11 @@ class OnPolicy(Checkpointed):
             "critic_coeff": cfg.critic_coef,
             "loss_critic_type": "l2",
         }
-        self.loss = self.make_loss(self.policy, self.critic, **common)
-        self.generator = generator(seed, "minibatches")
         self.costs = Costs(task, device) if actor is None else None
+        # Of our own actor the loss has the distribution alone, on the logits that the prices need as well: one pass.
+        acting = self.policy if self.costs is None else self.policy[-1]
+        self.loss = self.make_loss(acting, self.critic, functional=False, **common)
+        self.generator = generator(seed, "minibatches")
 
     @property
     def actor(self) -> TensorDictModuleBase:
@@ -95,10 +97,12 @@ class OnPolicy(Checkpointed):
         data, diagnostics = self.prepare(batch)
         averages = Averages()
         for rows in self.minibatches(data):
+            if self.costs is not None:
+                self.policy.get_dist_params(rows)  # writes the logits
             losses = self.loss(rows)
             total = losses["loss_objective"] + losses["loss_entropy"] + losses["loss_critic"]
             if self.costs is not None:
-                chosen = self.policy.get_dist(rows).mean
+                chosen = self.policy.build_dist_from_params(rows).mean
                 total = total + (rows["price_weight"] * price(self.costs, rows, chosen)).mean()
             norm = clipped_step(total, self.optimizer, self.parameters, self.cfg.max_grad_norm)
             averages.add(

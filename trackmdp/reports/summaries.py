@@ -75,7 +75,7 @@ def _note(study: Study) -> str:
 
 
 def shortened(study: Study) -> list[str]:
-    """Methods with fewer env steps than the options of the algorithm give them: ``ppo: 1,024,000 of 2,048,000``."""
+    """Methods with fewer env steps than the options of the algorithm give them: ``ppo: 1,024,000 of 1,536,000``."""
     found = []
     for method in study.methods:
         run = study.by_method(method)[0]

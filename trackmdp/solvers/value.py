@@ -36,6 +36,7 @@ from trackmdp.solvers.linear import (
 from trackmdp.solvers.walk import (
     Events,
     Passed,
+    Under,
     Walk,
     all_events,
     detected_codes,
@@ -59,6 +60,7 @@ def value_of(
     *,
     guess: Array | None = None,
     per_cell: bool = True,
+    under: Under | None = None,
 ) -> Evaluation:
     """The figures of a policy of one target; `trackmdp.solvers.evaluate` takes names and several targets as well.
 
@@ -69,6 +71,7 @@ def value_of(
         guess: `[M]`, where the solve begins on a grid too large to factorise, such as the clocked bound.
         per_cell: whether detections, sensors and safe actions are wanted of each start cell as well, which takes half
             as long again on a grid too large to factorise (a smaller one has them for nothing).
+        under: finds the events along the held-out tracks (`trackmdp.solvers.reach`); None: they are walked.
 
     Raises:
         UserError: the policy draws at random with unknown probabilities, or is for another grid.
@@ -78,16 +81,21 @@ def value_of(
     if isinstance(problem, Recorded):
         tracks = problem.held_out.limited(problem.max_steps)
         starts = tracks.cells[tracks.first[:-1]]
-        return replay(problem, tracks, table).evaluation(starts, problem.num_cells)
+        return replay(problem, tracks, table, under).evaluation(starts, problem.num_cells)
     if problem.max_steps is not None:
         return truncated_value(problem, table, problem.max_steps)
     return _whole_episodes(problem, table, guess, per_cell)
 
 
-def follow(task: Task, motion: Motion, policy: PolicyTable) -> tuple[Events, Iterator[Passed]]:
+def follow(
+    task: Task, motion: Motion, policy: PolicyTable, under: Under | None = None
+) -> tuple[Events, Iterator[Passed]]:
     """The events that a policy leads to, and their steps: only mass that it leaves undetected is followed."""
     acts = policy.sensed_by(task)
-    events = all_events(task, policy.task.keys, motion, acts.reports)
+    if under is None:
+        events = all_events(task, policy.task.keys, motion, acts.reports)
+    else:
+        events = under(acts.reports)
     return events, _steps(task, motion, events, acts)
 
 
@@ -252,13 +260,15 @@ def key_visits(problem: Problem, policy: PolicyTable) -> Array:
     return per_row(events.key[:known], visits[:known], events.keys.num_keys)
 
 
-def replay(task: Task, tracks: Tracks, policy: PolicyTable) -> ReplayedTracks:
+def replay(
+    task: Task, tracks: Tracks, policy: PolicyTable, under: Under | None = None
+) -> ReplayedTracks:
     """Follow `policy` along every recorded track, from its first cell.
 
     A renewal leads to later points of its track alone.
     """
     motion = tracks.motion()
-    events, found = follow(task, motion, policy)
+    events, found = follow(task, motion, policy, under)
     steps, count = list(found), len(events.codes)
     located, gathered = whole_renewals(steps, count)
     levels = Levels(tracks.places[events.state])

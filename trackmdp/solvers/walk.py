@@ -337,6 +337,8 @@ def _along_tracks(task: Task, motion: Motion, starts: Events, reports: Reports |
 
 Reports: TypeAlias = Callable[[int, IndexArray, IndexArray], Array]
 """From misses n, keys `[E]` and cells `[E]` to the probability of a report `[E]`."""
+Under: TypeAlias = Callable[[Reports], Events]
+"""Finds the events that can follow an episode's start under one policy."""
 
 
 def _following(

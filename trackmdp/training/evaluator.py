@@ -18,6 +18,7 @@ from trackmdp.sensing.task import Task
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluation import Evaluation, ReplayedTracks, regret_per_step
 from trackmdp.solvers.hidden import averaged
+from trackmdp.solvers.reach import Replays
 from trackmdp.solvers.value import replay, value_of
 from trackmdp.world.model import World
 from trackmdp.world.problem import Problem
@@ -135,10 +136,11 @@ class HeldOutEvaluator(Evaluator):
     def __init__(self, world: Recorded) -> None:
         super().__init__(world)
         self.tracks = world.held_out.limited(world.max_steps)
+        self._validation = Replays(world.selection)
 
     def score(self, policy: PolicyTable) -> Score:
         """Figures of a policy on the validation tracks."""
-        return Score(value_of(self.world.selection, policy), math.nan, math.nan)
+        return Score(self._validation.value(policy), math.nan, math.nan)
 
     def replayed(self, policy: PolicyTable) -> ReplayedTracks:
         """The totals of a policy on the held-out tracks."""
