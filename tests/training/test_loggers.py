@@ -26,7 +26,7 @@ EVENTS = pytest.importorskip("tensorboard.backend.event_processing.event_accumul
 
 
 def written(folder: Path) -> tuple[list[int], list[int], int]:
-    """Iterations of `metrics.csv`, frames of the event files, episodes of the log."""
+    """Iterations of `metrics.csv`, steps of the event files, episodes of the log."""
     events = EVENTS.EventAccumulator(str(folder / "tensorboard"))
     events.Reload()
     with EpisodeReader(folder / "episodes.mcap") as reader:
@@ -39,8 +39,8 @@ def test_all_three_are_written_and_each_goes_on_with_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     train(tmp_path / "whole", *ALL)
-    table, frames, episodes = written(tmp_path / "whole")
-    assert (table, frames) == ([2, 4, 6, 8], [256 * k for k in range(1, 9)])
+    table, steps, episodes = written(tmp_path / "whole")
+    assert (table, steps) == ([2, 4, 6, 8], list(range(1, 9)))
     assert episodes == 4  # of the first evaluation and the last
     assert to_dict(load_run_config(tmp_path / "whole"))["log"] == {
         "csv": {"every": 2},
@@ -51,7 +51,7 @@ def test_all_three_are_written_and_each_goes_on_with_the_run(
         at_iteration(patch, 6, killed)
         train(tmp_path / "half", *ALL)
     train(tmp_path / "half", *ALL, "resume=auto")
-    assert written(tmp_path / "half") == (table, frames, episodes)
+    assert written(tmp_path / "half") == (table, steps, episodes)
     assert rows(tmp_path / "half") == rows(tmp_path / "whole")
     logs = [(tmp_path / run / "episodes.mcap").read_bytes() for run in ("half", "whole")]
     assert logs[0] == logs[1]

@@ -80,13 +80,13 @@ def test_tensorboard_gets_the_same_numbers(tmp_path: Path) -> None:
     log = TensorboardLogger(TensorboardConfig(every=1), tmp_path)
     log.on_start(trainer(0))
     log.on_update(trainer(256), ROW)
-    log.on_update(trainer(512), ROW | {"frames": 512, "loss": None})
+    log.on_update(trainer(512), ROW | {"iteration": 2, "loss": None})
     log.on_end(TRAINER)
     read = events.EventAccumulator(str(tmp_path / "tensorboard"))
     read.Reload()
     assert [(event.step, event.value) for event in read.Scalars("aihtr")] == [
-        (256, pytest.approx(0.3)),
-        (512, pytest.approx(0.3)),
+        (1, pytest.approx(0.3)),
+        (2, pytest.approx(0.3)),
     ]
     assert len(read.Scalars("loss")) == 1
 

@@ -134,7 +134,7 @@ def test_mlflow_in_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     history = client.get_metric_history(run.info.run_id, "frames")
     assert [int(each.value) for each in history] == [int(row["frames"]) for row in table]
     aihtr = {each.step: each.value for each in client.get_metric_history(run.info.run_id, "aihtr")}
-    assert aihtr == {int(row["frames"]): float(row["aihtr"]) for row in table if row["aihtr"]}
+    assert aihtr == {int(row["iteration"]): float(row["aihtr"]) for row in table if row["aihtr"]}
     assert run.data.metrics["final/aihtr"] == load_run(tmp_path).evaluation.aihtr
     assert not (tmp_path / "mlruns").exists()
     (artifacts,) = (tmp_path / "mlflow").glob("*/artifacts")

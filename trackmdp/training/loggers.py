@@ -188,7 +188,10 @@ def known(row: Row) -> dict[str, float | int]:
 
 
 class TensorboardLogger(ResultLogger):
-    """TensorBoard event files in `tensorboard/`: figures over frames, pictures, options and final figures."""
+    """TensorBoard event files in `tensorboard/`: figures over iterations, pictures, options, final figures.
+
+    Not over frames: a learner that replays goes on after the last frame, and those rows would share one step.
+    """
 
     name = "tensorboard"
 
@@ -196,17 +199,17 @@ class TensorboardLogger(ResultLogger):
         """Open a file; an earlier process's events after its last checkpoint are hidden."""
         from torch.utils.tensorboard import SummaryWriter  # optional dependency, a second to import
 
-        folder, frames = self._folder / "tensorboard", trainer.position.frames
+        folder, done = self._folder / "tensorboard", trainer.position.iteration
         own_folder(folder)
         # TensorBoard reads all event files of a folder together and cannot drop a part of one; a new file with
         # purge_step hides the events of that step and later ones.
-        self._events = SummaryWriter(folder, purge_step=frames + 1 if frames else None)
-        self._events.add_text("config", f"```yaml\n{to_yaml(trainer.config)}\n```", frames)
+        self._events = SummaryWriter(folder, purge_step=done + 1 if done else None)
+        self._events.add_text("config", f"```yaml\n{to_yaml(trainer.config)}\n```", done)
 
     def write(self, row: Row) -> None:
         """Add the figures of `row`."""
         for key, value in known(row).items():
-            self._events.add_scalar(key, value, row["frames"])
+            self._events.add_scalar(key, value, row["iteration"])
 
     def results(
         self,
@@ -216,14 +219,14 @@ class TensorboardLogger(ResultLogger):
         trainer: Training,
     ) -> None:
         """Add pictures, the final figures, and for the view of hyperparameters the options."""
-        frames = trainer.position.frames
+        last = trainer.position.iteration
         for name, picture in pictures.items():
-            self._events.add_image(name, np.asarray(picture), frames, dataformats="HWC")
+            self._events.add_image(name, np.asarray(picture), last, dataformats="HWC")
         for key, value in figures.items():
-            self._events.add_scalar(key, value, frames)
+            self._events.add_scalar(key, value, last)
         options = {key: str(value) for key, value in flatten(to_dict(trainer.config)).items()}
         # In the same folder: by default a run of its own, named by the time, would appear beside this one.
-        self._events.add_hparams(options, dict(figures), run_name=".", global_step=frames)
+        self._events.add_hparams(options, dict(figures), run_name=".", global_step=last)
 
     def close(self, error: BaseException | None) -> None:  # noqa: ARG002
         """Close the file."""
@@ -317,7 +320,7 @@ class WandbLogger(_Tracker):
 
 
 class MlflowLogger(_Tracker):
-    """MLflow: the options as parameters, a row per logged iteration over frames, final figures, pictures, the policy.
+    """MLflow: the options as parameters, a row per logged iteration, final figures, pictures, the policy.
 
     By MLflow's client itself, for TorchRL's logger always begins another run. A resumed run goes on with the same one;
     rows that an earlier process logged after its last checkpoint are not logged twice.
@@ -376,15 +379,15 @@ class MlflowLogger(_Tracker):
         """Log the row, unless it is there."""
         measured = known(row)
         if measured["iteration"] > self._logged:
-            self._log(measured, int(measured["frames"]))
+            self._log(measured, int(measured["iteration"]))
 
-    def _log(self, row: Mapping[str, float], frames: int) -> None:
+    def _log(self, row: Mapping[str, float], iteration: int) -> None:
         from mlflow.entities import Metric
 
         now = int(time.time() * 1000)
         with _answering("mlflow"):
             self._client.log_batch(
-                self._id, metrics=[Metric(key, value, now, frames) for key, value in row.items()]
+                self._id, metrics=[Metric(key, value, now, iteration) for key, value in row.items()]
             )
 
     def results(
@@ -395,7 +398,7 @@ class MlflowLogger(_Tracker):
         trainer: Training,
     ) -> None:
         """Log the final figures, and pictures and policy as artifacts."""
-        self._log(figures, trainer.position.frames)
+        self._log(figures, trainer.position.iteration)
         with _answering("mlflow"):
             for name, picture in pictures.items():
                 self._client.log_image(self._id, picture, f"{name}.png")
