@@ -45,6 +45,17 @@ def test_the_iteration_solves_what_the_factorisation_solves(
     assert (found + error >= exact - 1e-12 * longest).all()
 
 
+@pytest.mark.parametrize("cells", [9, 225])
+def test_a_price_in_states_that_are_not_reached_leaves_no_rounding_elsewhere(cells: int) -> None:
+    rng, known = np.random.default_rng(0), np.arange(cells) % 2 == 0
+    stays, transition = np.eye(cells)[known], random_kernel(rng, cells, 0.05)
+    transition[np.ix_(known, ~known)] = 0.0
+    transition[known] = 0.9 * stays + 0.09 * transition[known]
+    priced = np.stack([np.where(known, 1.0, -price) for price in (1.0, 1e14)], axis=1)
+    cheap, dear = accumulate(sparse.csr_array(transition), priced)[known].T
+    np.testing.assert_allclose(dear, cheap, rtol=1e-13)
+
+
 @pytest.mark.parametrize("one_by_one", [False, True])
 @pytest.mark.parametrize("transposed", [False, True])
 @settings(max_examples=10)

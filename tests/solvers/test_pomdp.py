@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from tests.solvers.worlds import best_of_all, tiny_worlds
 from trackmdp.errors import UserError
 from trackmdp.solvers import optimal, pomdp
+from trackmdp.world.make import make_world
 from trackmdp.world.model import World
 
 
@@ -24,6 +25,13 @@ def test_the_same_optimum_as_on_chains(world: World) -> None:
 @given(tiny_worlds(most_t_max=1))
 def test_the_same_optimum_as_by_brute_force(world: World) -> None:
     np.testing.assert_allclose(pomdp.solve(world).value, best_of_all(world), rtol=1e-8, atol=1e-8)
+
+
+def test_a_safe_action_that_nobody_would_take_may_cost_anything() -> None:
+    """Beside a large D the margin of a better choice stays that of the numbers compared."""
+    world = make_world("random_support", size=3, support_size=3, cost=0.22)
+    dear, dearest = (pomdp.solve(world.but(safe_cost=price)).value for price in (1e2, 1e12))
+    np.testing.assert_allclose(dearest, dear, rtol=1e-12)
 
 
 def test_belief_states_are_counted_once() -> None:

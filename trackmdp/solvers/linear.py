@@ -400,10 +400,12 @@ def _factorised(system: sparse.csr_array, full: int = FULL) -> Callable[[Array, 
         UserError: the matrix is exactly singular.
     """
     if system.shape[0] <= full:
-        factors, pivots, singular = dgetrf(system.toarray(order="F"), overwrite_a=True)
+        # Transposed, each column is dominated by its diagonal, so that no rows are exchanged: a huge price in states
+        # that are not reached would leave its rounding in the others.
+        factors, pivots, singular = dgetrf(system.toarray().T, overwrite_a=True)
         if singular:
             raise UserError(_ENDLESS)
-        return lambda wanted, transposed: dgetrs(factors, pivots, wanted, trans=int(transposed))[0]
+        return lambda wanted, transposed: dgetrs(factors, pivots, wanted, trans=not transposed)[0]
     try:
         # Without pivoting, which a matrix with dominant diagonal does not need: that keeps the fill low.
         factors = splu(

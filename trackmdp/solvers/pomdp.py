@@ -69,7 +69,8 @@ def solve_states(
     while True:
         worth = reward + moves @ value
         best = np.maximum.reduceat(worth, first)
-        better = best > worth[choice] + 1e-12 * (1.0 + np.abs(value).max())
+        # By more than rounding, of the numbers that a choice leads to: beside a large D no gain would count elsewhere.
+        better = best > (worth + 1e-12 * (1.0 + np.abs(reward) + moves @ np.abs(value)))[choice]
         if not better.any():
             break
         attained = np.flatnonzero(worth >= best[owner])  # of each state the first one counts
