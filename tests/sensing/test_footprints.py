@@ -98,6 +98,20 @@ def test_the_environment_and_simulation_earn_the_exact_value() -> None:
     assert share.item() == pytest.approx(evaluate(world, policy).accuracy, abs=0.01)
 
 
+@pytest.mark.parametrize("k", [0, 2, 3])
+def test_subsets_in_a_window_or_among_cells_without_a_sensor_are_valued_exactly(
+    k: int,
+) -> None:
+    wide, matrix = _wide().but(detection=0.8), discs((3, 3), np.array([(1, 1)]), 1).toarray()
+    assert wide.coverage is not None
+    with_one_less = wide.but(
+        coverage=np.vstack([wide.coverage.matrix.toarray(), matrix]), cost=[*wide.cost, np.nan]
+    )
+    wanted = evaluate(wide, Policy.random_k(wide, k)).aihtr
+    for world in (wide.but(window=2), with_one_less):
+        assert evaluate(world, Policy.random_k(world, k)).aihtr == pytest.approx(wanted, rel=1e-12)
+
+
 def test_the_environment_is_that_of_one_cell_each_where_footprints_are() -> None:
     world = small_world()
     turned = World.of(world, world.kernel, coverage=np.eye(9)[::-1], cost=world.cost[::-1])

@@ -112,7 +112,7 @@ class SetTable:
         coverage = self.task.coverage
         if coverage is None:
             return self.sets
-        found = reported(self.sets, self._covers.T.tocsr())
+        found = reported(self.sets, self._covers.T.tocsr(), self.k)
         return found.astype(np.bool_) if self.deterministic else found
 
     @cached_property
@@ -120,7 +120,7 @@ class SetTable:
         """`[plans * (t_max + 1), M]`, probability of a report of a target in each cell; bool where all are certain."""
         task = self.task
         if task.coverage is not None and not task.perfect:
-            return reported(self.sets, task.sees_by_cell.T.tocsr())
+            return reported(self.sets, task.sees_by_cell.T.tocsr(), self.k)
         if task.perfect:
             return self.seen
         assert self.sets is not None

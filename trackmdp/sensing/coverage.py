@@ -99,13 +99,18 @@ class Coverage:
         return found.reshape(*action.shape[:-1], -1)
 
 
-def reported(sets: sparse.csr_array, sees: sparse.csr_array) -> sparse.csr_array:
+def reported(
+    sets: sparse.csr_array, sees: sparse.csr_array, k: int | None = None
+) -> sparse.csr_array:
     """`[R, M]` CSR, the probability 1 - Π (1 - p) that some sensor reports a target in each cell.
 
     Args:
         sets: `[R, S]`, probabilities of each sensor's being on, independently of each other.
         sees: `[S, M]`, probabilities that a sensor that is on reports a target.
+        k: exactly so many sensors of each row are on, or all where it has fewer, each such subset as likely.
     """
+    if k is not None:
+        return _of_subsets(sets, sees, k)
     # Of a set drawn with probabilities q, sensor s stays silent with 1 - q p; log Π = Σ log(1 - q p), and a sensor that
     # certainly reports gives -inf, and so exactly 1. With q = 1 or p = 1 everywhere the logs are a sparse product.
     certain = (sets.data == 1.0).all()
@@ -129,6 +134,22 @@ def _each_log(sets: sparse.csr_array, sees: sparse.csr_array) -> sparse.csr_arra
     return sparse.csr_array(
         (logs, (rows[place], each.indices)), shape=(sets.shape[0], sees.shape[1])
     )
+
+
+def _of_subsets(sets: sparse.csr_array, sees: sparse.csr_array, k: int) -> sparse.csr_array:
+    """See `reported`: `shared_out` for all rows with the same number of sensors at a time."""
+    each, cells = sees[sets.indices], sees.shape[1]
+    code = row_index(sets)[row_index(each)].astype(np.int64) * cells + each.indices
+    # A row for each pair of a row of `sets` and a cell, with the sensors that cover it.
+    pairs, pair = np.unique(code, return_inverse=True)
+    covering = sparse.csr_array(
+        (each.data, (pair, np.arange(len(code)))), shape=(len(pairs), len(code))
+    )
+    count, found = np.diff(sets.indptr)[pairs // cells], np.zeros(len(pairs))
+    for sensors in np.unique(count).tolist():
+        here = count == sensors
+        found[here] = shared_out(covering[here], 0.0, min(k, sensors), sensors)
+    return sparse.csr_array((found, np.divmod(pairs, cells)), shape=(sets.shape[0], cells))
 
 
 def shared_out(
