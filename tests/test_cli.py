@@ -186,6 +186,10 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         ("replay file=x speed=2", "speed=2: without effect where no episode is played"),
         ("replay file=x speed=2 episode=0 verify=true", "speed=2: without effect where no"),
         ("evaluate run=nowhere task.memory=cell", "task.memory=cell: not together with run="),
+        (
+            "evaluate baseline=qmdp log=[mcap] episodes=0",
+            "episodes=0: expected at least 1 with log=[mcap]",
+        ),
     ],
 )
 def test_mistakes_end_in_one_line(

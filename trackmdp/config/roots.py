@@ -158,6 +158,8 @@ class EvaluateConfig(ComputingConfig):
                 raise refuse("baseline", self.baseline.name, f"one that does not draw {several}")
         if not all(node.episodes_only for node in self.log.values()):
             raise refuse("log", listed(self.log), "[mcap] or []; an evaluation has no iterations")
+        if self.log and not self.episodes:
+            raise refuse("episodes", 0, f"at least 1 with log={listed(self.log)}")
 
     def ignored(self, root: Any) -> dict[str, str]:
         """Of several targets as many episodes are simulated as `evaluation.width` asks for, and logged as are named."""
