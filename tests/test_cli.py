@@ -183,6 +183,8 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
             "report sweep=. watch=true threshold=1",
             "threshold=1: without effect with watch=true",
         ),
+        ("replay file=x layout=y episode=3", "episode=3: without effect with layout= or recover="),
+        ("replay file=x recover=true episode=3", "episode=3: without effect with layout= or"),
         ("replay file=x speed=2", "speed=2: without effect where no episode is played"),
         ("replay file=x speed=2 episode=0 verify=true", "speed=2: without effect where no"),
         ("evaluate run=nowhere task.memory=cell", "task.memory=cell: not together with run="),

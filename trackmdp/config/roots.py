@@ -261,10 +261,13 @@ class ReplayConfig(CommandConfig):
     speed: float = option("speed of playing", unit="steps/s", gt=0, le=1000)
 
     def ignored(self, root: Any) -> dict[str, str]:
-        """An episode is played where nothing else is asked for."""
-        others = (self.html, self.csv, self.layout, self.verify, self.recover)
-        played = self.episode is not None and not any(others)
-        return {} if played else {"speed": "where no episode is played, which episode=N alone does"}
+        """An episode is played where nothing else is asked for; layout and recover are of the whole log."""
+        of_one, of_all = (self.html, self.csv, self.verify), (self.layout, self.recover)
+        unread = {"speed": "where no episode is played, which episode=N alone does"}
+        if not any(of_one + of_all):
+            return unread if self.episode is None else {}
+        why = "with layout= or recover=true, which are of the whole log"
+        return unread if any(of_one) else unread | {"episode": why}
 
 
 class ReportConfig(CommandConfig):
