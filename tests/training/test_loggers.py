@@ -125,7 +125,10 @@ def test_an_option_of_a_logger_that_the_run_does_not_have(tmp_path: Path) -> Non
     [
         ("log=[csv,nope]", "log=nope: expected one of csv, tensorboard, wandb, mlflow, mcap"),
         ("log=nope", "log=nope: expected one of csv, tensorboard, wandb, mlflow, mcap"),
-        ("log=null", "log=null: expected one of csv, tensorboard, wandb, mlflow, mcap"),
+        (
+            "log=null",
+            "log=null: expected one of csv, tensorboard, wandb, mlflow, mcap, or log=[] for none",
+        ),
         ("log=csv,mcap", "log=csv,mcap: expected log=[csv,mcap]"),
         ("log.every=2", "log.every: renamed, expected log.csv.every"),
         (

@@ -93,7 +93,8 @@ def check_choice(group: str, name: Any) -> None:
         raise UserError(f"{former}: renamed, expected {RENAMED[former]}")
     if group in _VALUES and name is not None and is_number(str(name)):
         raise UserError(f"{group}={name}: expected {_VALUES[group]}={name}")
-    raise refuse(group, name, f"one of {', '.join(GROUPS[group])}")
+    none = ", or log=[] for none" if group == "log" and name is None else ""
+    raise refuse(group, name, f"one of {', '.join(GROUPS[group])}{none}")
 
 
 def validate(cfg: _T, place: str = "", root: Any = None) -> _T:
