@@ -193,6 +193,18 @@ def test_what_several_targets_cannot_do_is_refused(
     assert "targets.count=3: expected 2, as the policy has" in capsys.readouterr().err
     assert main(["evaluate", f"run={tmp_path}", "targets.count=1"]) == 2
     assert "targets.count=1: expected at least 2, as the run has" in capsys.readouterr().err
+    assert main(["evaluate", f"run={tmp_path}", "targets.merge=union"]) == 2
+    assert "targets.merge=union: without effect with algo=a2c" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("word", ["targets.merge=union", "evaluation.width=0.1"])
+def test_a_run_of_one_target_takes_no_option_of_several(
+    word: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    tm.train(group().kinds[0], folder=tmp_path, **{"optimal.enabled": False})
+    assert main(["evaluate", f"run={tmp_path}", word]) == 2
+    assert f"{word}: without effect with targets.count=1" in capsys.readouterr().err
+    assert not (tmp_path / "evaluation.json").exists()
 
 
 @pytest.mark.parametrize("algo", ["a2c", "dqn"])

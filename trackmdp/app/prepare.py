@@ -174,21 +174,7 @@ def _check_files(cfg: CommandConfig, folder: Path, words: Sequence[str]) -> None
 
         cell_classes(classes, cfg.grid.sides)
     if runs := _runs(cfg):
-        # False alarms are for testing trained policies.
-        believed = isinstance(getattr(cfg, "sensor", None), config.FalseAlarmConfig)
-        own = {"grid", "kernel", "cost", "task"} | ({"sensor"} if not believed else set())
-        for word in words:
-            if key_of(word).split(".")[0] in own:
-                raise UserError(
-                    f"{word}: not together with run={','.join(runs)}: its own world is used"
-                )
-        typed = by_key(words).get("targets.count")
-        for run in runs:
-            learned = load_run_config(run).targets.count
-            if typed and isinstance(cfg, config.EvaluateConfig) and cfg.targets.count < learned:
-                raise UserError(
-                    f"targets.count={typed}: expected at least {learned}, as the run has"
-                )
+        _check_runs(cfg, runs, words)
     elif isinstance(cfg, config.ExportConfig):
         load_run_config(cfg.run)
     elif isinstance(cfg, config.ReportConfig):
@@ -201,6 +187,32 @@ def _check_files(cfg: CommandConfig, folder: Path, words: Sequence[str]) -> None
             )
     elif isinstance(cfg, config.ReplayConfig):
         _check_outputs(cfg)
+
+
+def _check_runs(cfg: CommandConfig, runs: Sequence[str], words: Sequence[str]) -> None:
+    """Refuse words that contradict the runs whose world and policy are judged, or that these leave without effect."""
+    # False alarms are for testing trained policies.
+    believed = isinstance(getattr(cfg, "sensor", None), config.FalseAlarmConfig)
+    own = {"grid", "kernel", "cost", "task"} | ({"sensor"} if not believed else set())
+    for word in words:
+        if key_of(word).split(".")[0] in own:
+            raise UserError(
+                f"{word}: not together with run={','.join(runs)}: its own world is used"
+            )
+    typed = by_key(words)
+    for run in runs:
+        learned = load_run_config(run)
+        if not isinstance(cfg, config.EvaluateConfig):
+            continue
+        least = learned.targets.count
+        if "targets.count" in typed and cfg.targets.count < least:
+            raise UserError(
+                f"targets.count={typed['targets.count']}: expected at least {least}, as the run has"
+            )
+        learned.targets.count = max(least, cfg.targets.count)
+        # Whether they are read is up to how many targets the run has, and to what it learned of them.
+        several = ("targets.", "evaluation.")
+        refuse_ignored(learned, {k: v for k, v in typed.items() if k.startswith(several)})
 
 
 def _check_outputs(cfg: config.ReplayConfig) -> None:
