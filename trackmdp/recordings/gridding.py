@@ -19,6 +19,8 @@ from trackmdp.recordings.tracks import Tracks, ends_of
 _WIDEST = 12.0
 """Degrees of longitude that one UTM zone, six degrees wide, is stretched over at most."""
 
+_TORN = 1e7
+"""Metres of a step over 180 degrees that is one around the world; a projection that is whole there has far less."""
 
 _MOST = 2**27
 """Steps of all tracks together; times in milliseconds and a step in seconds would make thousands for each report."""
@@ -128,7 +130,8 @@ def _placed(
     if positions.geographic:
         code = grid.crs or _utm(positions.x[says], positions.y[says], source)
         x, y = map(np.asarray, projection(code).transform(positions.x, positions.y))
-        flat = replace(positions, x=x, y=y)  # inf where the projection does not reach
+        # inf where the projection does not reach
+        flat = replace(positions, x=x, y=y, piece=positions.piece + _seams(positions.x, x, y))
     elif grid.crs is not None:
         raise UserError(
             f"{source}: has x and y, which are not projected; grid.crs={grid.crs} is for lat and lon"
@@ -139,6 +142,13 @@ def _placed(
         else projected(code, grid.origin)
     )
     return flat, Place(corner, grid.cell, code, positions.downwards)
+
+
+def _seams(lon: Array, x: Array, y: Array) -> np.ndarray:
+    """`[P]` seams of the projection up to each report: where it is torn at 180 degrees, no straight line leads across."""
+    with np.errstate(invalid="ignore"):  # inf less inf
+        torn = (np.abs(np.diff(lon)) > 180.0) & (np.hypot(np.diff(x), np.diff(y)) > _TORN)
+    return np.append(0, np.cumsum(torn))
 
 
 def _utm(x: Array, y: Array, source: str) -> str:
@@ -192,8 +202,10 @@ def _sampled(positions: Positions, grid: Gridding) -> tuple[np.ndarray, Array, A
     # Rounding must not carry the last sample into the pause, where the line leads to another target.
     wanted = np.minimum(ranks(of) * grid.step, length[of]) + pause[of]
     x, y = (np.interp(wanted, axis, column) for column in (positions.x, positions.y))
-    track = positions.track
-    final = np.append(track[1:] != track[:-1], True)[end]
+    # Pieces are in the order of the file, perhaps the newest first.
+    latest = np.full(positions.track.max() + 1, -np.inf)
+    np.maximum.at(latest, positions.track, positions.time)
+    final = positions.time[end] == latest[positions.track[end]]
     return start[of], x, y, final[of]
 
 

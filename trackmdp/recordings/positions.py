@@ -218,6 +218,8 @@ def _chosen_columns(names: Iterable[str], own: Sequence[str]) -> dict[str, str]:
         for name, columns in usual.items()
     }
     pairs = [pair for pair in (("x", "y"), ("lon", "lat")) if all(found[name] for name in pair)]
+    named = {each.partition(":")[0] for each in own}
+    pairs = [pair for pair in pairs if named & {*pair}] or pairs  # a file may have both
     missing = [
         f"{name} ({', '.join(usual[name][:3])})" for name in ("id", "time") if not found[name]
     ]
@@ -332,7 +334,8 @@ def _feature(feature: Mapping[str, Any], number: int) -> Iterator[tuple[Any, ...
     name = f"line {number}" if own is None else own
     for place, (line, stamps) in enumerate(zip(lines, [times] if single else times, strict=True)):
         for point, stamp in zip(line, stamps, strict=True):
-            yield name, stamp, *point[:2], len(lines) * number + place
+            # Lines of other features with the same id are pieces of their own: 0 and 0.5, then 1, 1.33 and 1.67.
+            yield name, stamp, *point[:2], number + place / len(lines)
 
 
 def gpx(stream: BinaryIO) -> Positions:
