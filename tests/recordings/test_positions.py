@@ -16,7 +16,14 @@ import pytest
 import trackmdp as tm
 from tests.tracks import digest_of
 from trackmdp.errors import UserError, adding
-from trackmdp.recordings.positions import IGNORED, NO_IDENTITY, NO_POSITION, REPEATED, Positions
+from trackmdp.recordings.positions import (
+    IGNORED,
+    NO_IDENTITY,
+    NO_POSITION,
+    REPEATED,
+    Positions,
+    frame_positions,
+)
 from trackmdp.recordings.track_files import read_positions
 
 NOON = 1714564800.0  # 2024-05-01T12:00:00Z
@@ -380,6 +387,15 @@ def test_a_file_with_neither_positions_nor_cells_is_refused_by_its_columns(tmp_p
     assert "kernel.columns" in str(caught.value)
 
 
-def test_columns_are_those_of_a_table(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="only for a table of positions"):
-        tm.load_tracks(tmp_path / "a.gpx", format="gpx", columns=COLUMNS, **OPTIONS)
+@pytest.mark.parametrize("format", ["gpx", "cells"])
+def test_columns_and_frames_are_those_of_a_table(tmp_path: Path, format: str) -> None:
+    with pytest.raises(UserError, match=f"^kernel.format={format}: .* points with kernel.columns="):
+        tm.load_tracks(tmp_path / "a.gpx", format=format, columns=COLUMNS, **OPTIONS)
+    with pytest.raises(UserError, match=f"^kernel.format={format}: .* points with a DataFrame"):
+        tm.load_tracks(pd.DataFrame(), format=format, **OPTIONS)
+
+
+@pytest.mark.parametrize("named", ["x", "lon"])
+def test_of_a_table_with_x_y_and_lat_lon_those_that_are_named_count(named: str) -> None:
+    table = pd.DataFrame({"id": [1], "t": 0, "x": 2.0, "y": 3.0, "lon": 8.5, "lat": 47.5})
+    assert frame_positions(table, [f"{named}:{named}"]).geographic == (named == "lon")

@@ -68,8 +68,6 @@ def read_positions(path: str | Path, kind: str, columns: Sequence[str] = ()) -> 
     _, words, needed, reader = _READERS[kind]
     for module in needed:
         require(module, "tracks", source)
-    if columns and kind != "points":
-        raise UserError(f"kernel.columns={list(columns)}: only for a table of positions")
     with (
         opened(Path(path), most=LONGEST, source=source, links=True) as stream,
         decoded(source, words),
@@ -124,13 +122,22 @@ def read_track_file(
     in_memory = not isinstance(path, str | Path)
     source = "load_tracks" if in_memory else f"kernel.path={path}"
     kind = "points" if in_memory or columns else format or _format_of(path)
+    if format not in (None, kind):
+        table = "a DataFrame" if in_memory else f"kernel.columns={list(columns)}"
+        raise UserError(
+            f"kernel.format={format}: expected points with {table}, of a table of positions"
+        )
     if kind == "cells":
         for name in ("step", "max_gap"):
             if name in own:
                 raise UserError(
                     f"kernel.{name}={own[name]}: only for positions; {source} holds cells"
                 )
-        place = Place.of(*(given[name] for name in ("cell", "origin", "crs")))
+        where = {name: given[name] for name in ("cell", "origin", "crs")}
+        place = Place.of(**where)
+        if place is None and (alone := own.keys() & where):
+            expected = "grid.cell and grid.origin, the place of the grid"
+            raise UserError(f"grid.{min(alone)}: expected {expected}; {source} holds cells")
         tracks = read_tracks(path, size, exits=exits, shortest=shortest)
         return split(tracks, *draw), {}, place
     for option, expected in (
@@ -149,7 +156,7 @@ def read_track_file(
         with decoded(source, "a table of positions"):
             positions = _some(frame_positions(path, columns), source, "a table of positions")
         return _on_grid(positions, made, source, draw)
-    return once(_read_on_grid, path, format or kind, made, columns, draw)
+    return once(_read_on_grid, path, kind, made, columns, draw)
 
 
 def _read_on_grid(
