@@ -385,9 +385,9 @@ def test_cells_need_no_gridding(tmp_path: Path) -> None:
         UserError, match=r"^kernel\.step=50\.0: only for positions; kernel\.path=.* holds cells$"
     ):
         tm.load_tracks(file, 3, step=50)
-    for given in ({"cell": 50}, {"origin": [1, 2]}, {"crs": "EPSG:2056"}):
+    for place in ({"cell": 50}, {"origin": [1, 2]}, {"crs": "EPSG:2056"}):
         with pytest.raises(UserError, match=r": expected grid\.cell and grid\.origin, .* cells$"):
-            tm.load_tracks(file, 3, **given)
+            tm.load_tracks(file, 3, **place)
     with pytest.raises(
         UserError,
         match=r"expected a file that ends with one of \.csv, \.npz, .*, or kernel\.format$",

@@ -145,7 +145,7 @@ def _placed(
 
 
 def _seams(lon: Array, x: Array, y: Array) -> np.ndarray:
-    """`[P]` seams of the projection up to each report: where it is torn at 180 degrees, no straight line leads across."""
+    """`[P]` seams of the projection up to each report: torn at 180 degrees, it has no straight line across."""
     with np.errstate(invalid="ignore"):  # inf less inf
         torn = (np.abs(np.diff(lon)) > 180.0) & (np.hypot(np.diff(x), np.diff(y)) > _TORN)
     return np.append(0, np.cumsum(torn))

@@ -128,16 +128,7 @@ def read_track_file(
             f"kernel.format={format}: expected points with {table}, of a table of positions"
         )
     if kind == "cells":
-        for name in ("step", "max_gap"):
-            if name in own:
-                raise UserError(
-                    f"kernel.{name}={own[name]}: only for positions; {source} holds cells"
-                )
-        where = {name: given[name] for name in ("cell", "origin", "crs")}
-        place = Place.of(**where)
-        if place is None and (alone := own.keys() & where):
-            expected = "grid.cell and grid.origin, the place of the grid"
-            raise UserError(f"grid.{min(alone)}: expected {expected}; {source} holds cells")
+        place = _place_of_cells(own, source)
         tracks = read_tracks(path, size, exits=exits, shortest=shortest)
         return split(tracks, *draw), {}, place
     for option, expected in (
@@ -157,6 +148,22 @@ def read_track_file(
             positions = _some(frame_positions(path, columns), source, "a table of positions")
         return _on_grid(positions, made, source, draw)
     return once(_read_on_grid, path, kind, made, columns, draw)
+
+
+def _place_of_cells(own: Mapping[str, Any], source: str) -> Place | None:
+    """The place by hand of the grid of a file of cells.
+
+    Raises:
+        UserError: a part of it is missing, or there is an option of positions.
+    """
+    for name in ("step", "max_gap"):
+        if name in own:
+            raise UserError(f"kernel.{name}={own[name]}: only for positions; {source} holds cells")
+    place = Place.of(*(own.get(name) for name in ("cell", "origin", "crs")))
+    if place is None and own:
+        expected = "grid.cell and grid.origin, the place of the grid"
+        raise UserError(f"grid.{min(own)}: expected {expected}; {source} holds cells")
+    return place
 
 
 def _read_on_grid(
