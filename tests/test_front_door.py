@@ -7,6 +7,7 @@ import inspect
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -169,6 +170,34 @@ def test_an_argument_of_another_kind_is_one_line() -> None:
         tm.make_world(np.eye(9))  # type: ignore[arg-type]
     with pytest.raises(UserError, match="a int, expected the path of a file, or a DataFrame"):
         tm.load_tracks(3)
+
+
+WORLD = tm.make_world("random_walk", size=3, exit_probability=0.2)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: tm.load_run(3), "load_run: a int, expected a path"),
+        (lambda: tm.Policy.load(None), "load: a NoneType, expected a path"),
+        (lambda: tm.Policy.all_on(WORLD).save(3), "save: a int, expected a path"),
+        (lambda: tm.export(tm.Policy.all_on(WORLD), 3), "export: a int, expected a path"),
+        (lambda: tm.train(WORLD, folder=3), "folder: a int, expected a path"),
+        (lambda: tm.train(WORLD, callbacks=3), "callbacks: a int, expected a list of Callback"),
+        (lambda: tm.compare(WORLD, 3), "compare: a int, expected a list or dict of policies"),
+        (lambda: tm.compare(WORLD, "none"), "compare: a str, expected a list or dict of policies"),
+        (lambda: tm.Policy.all_on(3), "policy: a int, expected a world or recorded tracks"),
+        (lambda: tm.Policy.random_k(3, 1), "policy: a int, expected a world or recorded tracks"),
+        (lambda: WORLD.but(reward="x"), "reward=x: expected a number from 0"),
+        (lambda: WORLD.but(safe_cost="x"), "safe_cost=x: expected a number from 0"),
+        (lambda: tm.evaluate(WORLD, "none", false_alarm="x"), "false_alarm=x: expected a prob"),
+        (lambda: tm.frontier(WORLD).at(sensors="x"), "sensors: a str, expected a number"),
+    ],
+)
+def test_a_wrong_type_is_told_in_one_line(call: Callable[..., Any], message: str) -> None:
+    with pytest.raises(UserError) as caught:
+        call()
+    assert str(caught.value).startswith(message)
 
 
 def test_completion_offers_public_names_alone() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 from pathlib import Path
 
 FAILED, USER_MISTAKE, INTERRUPTED = 1, 2, 130
@@ -39,6 +40,17 @@ class Preempted(BaseException):
 
     def __str__(self) -> str:
         return f"stopped by signal {self.signal}"
+
+
+def path_of(given: object, name: str) -> Path:
+    """The path that was given for `name` from Python.
+
+    Raises:
+        UserError: it is none.
+    """
+    if not isinstance(given, (str, os.PathLike)):
+        raise UserError(f"{name}: a {type(given).__name__}, expected a path")
+    return Path(given)
 
 
 def message_of(error: BaseException) -> str:

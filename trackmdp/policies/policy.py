@@ -23,7 +23,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from trackmdp.arrays.entries import with_data
 from trackmdp.arrays.types import Array
-from trackmdp.errors import UserError
+from trackmdp.errors import UserError, path_of
 from trackmdp.policies.forms import (
     STATE_KEYS,
     acting,
@@ -105,9 +105,9 @@ class Policy(TensorDictModuleBase, PolicyTable):
 
         Where fewer than k can be chosen, as in a window at the border, all of them are on.
         """
+        near = PolicyTable.all_on(task).sets
         if task.window is None and task.available.all():
             return cls(task, probability=k / task.total_sensors, k=k)
-        near = PolicyTable.all_on(task).sets
         assert near is not None
         count = np.diff(near.indptr)
         # Each sensor's own probability of being among the k of its window.
@@ -271,7 +271,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
 
     def save(self, file: str | Path, value: Array | None = None) -> None:
         """Write `policy.npz`; see `trackmdp.policies.saved`."""
-        save_policy(Path(file), self, value)
+        save_policy(path_of(file, "save"), self, value)
 
     @classmethod
     def load(cls, file: str | Path) -> Policy:
@@ -280,7 +280,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
         Raises:
             UserError: the file is missing or damaged, or holds something else.
         """
-        return cls.from_table(load_policy(Path(file))[0])
+        return cls.from_table(load_policy(path_of(file, "load"))[0])
 
 
 def as_policy(task: Task, policy: PolicyLike) -> Policy:

@@ -178,6 +178,8 @@ class PolicyTable(Carded, SetTable):
         probability: float | None = None,
         k: int | None = None,
     ) -> None:
+        if not isinstance(task, Task):
+            raise UserError(f"policy: a {type(task).__name__}, expected a world or recorded tracks")
         if (sets is None) == (probability is None):
             raise UserError("policy: expected either sets or one probability for all sensors")
         if probability is not None and not 0.0 <= probability <= 1.0:

@@ -367,6 +367,6 @@ def window_cells(size: tuple[int, int], window: int) -> sparse.csr_array:
 
 
 def _price(name: str, value: float, most: float = LARGEST_PRICE) -> float:
-    if not 0 <= value <= most:
+    if not isinstance(value, int | float | np.number) or not 0 <= value <= most:
         raise UserError(f"{name}={value}: expected a number from 0 to {most:g}")
     return float(value)

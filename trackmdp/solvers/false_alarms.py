@@ -79,7 +79,8 @@ def check_alarms(problem: Problem, false_alarm: float) -> World:
     world = modelled(problem, source)
     expected = {
         "targets without modes": world.modes == 1,
-        "a probability below 1": 0.0 <= false_alarm < 1.0,
+        "a probability below 1": isinstance(false_alarm, int | float | np.number)
+        and 0.0 <= false_alarm < 1.0,
         f"at most {_MOST_CELLS} cells": world.num_cells <= _MOST_CELLS,
         "whole episodes, and a safe action that always locates": world.max_steps is None
         and world.safe,

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from numbers import Real
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
@@ -222,6 +223,9 @@ class Tradeoff(Carded):
         if (accuracy is None) == (sensors is None):
             given = "neither" if accuracy is None else "both"
             raise UserError(f"expected exactly one of accuracy and sensors, got {given}")
+        for name, value in (("accuracy", accuracy), ("sensors", sensors)):
+            if not isinstance(value, Real | None):
+                raise UserError(f"{name}: a {type(value).__name__}, expected a number")
         if accuracy is not None:
             return self._mixture("accuracy", accuracy, [c.accuracy for c in self.corners])
         assert sensors is not None

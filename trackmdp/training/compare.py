@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias, TypeVar
@@ -135,6 +135,10 @@ def compare(problem: Subject, policies: Mapping[str, Any] | Sequence[Any]) -> Co
         ['Policy 2 earns 1,071.000 more per episode than all_on (exact).']
     """
     check_problem(problem, "compare")
+    if isinstance(policies, str) or not isinstance(policies, Iterable):
+        raise UserError(
+            f"compare: a {type(policies).__name__}, expected a list or dict of policies"
+        )
     named = policies if isinstance(policies, Mapping) else _named(policies)
     if len(named) < 2:
         raise UserError(f"compare: {len(named)} policies, expected at least two")

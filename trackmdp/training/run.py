@@ -20,7 +20,7 @@ from trackmdp.algos.common import make_algorithm
 from trackmdp.arrays.types import Array
 from trackmdp.config import load_run_config
 from trackmdp.config.tree import config_digest
-from trackmdp.errors import UserError
+from trackmdp.errors import UserError, path_of
 from trackmdp.machine import torch_threads
 from trackmdp.notebook.card import NONE, Card, Carded, decimal, grid_words
 from trackmdp.policies.policy import Policy
@@ -190,7 +190,7 @@ def load_run(folder: str | Path) -> Run:
     Raises:
         UserError: the folder is no finished run's, or a file in it is damaged.
     """
-    place = Path(folder)
+    place = path_of(folder, "load_run")
     if not (place / SUMMARY).is_file():
         raise UserError(f"run={folder}: not the folder of a finished run (it has no {SUMMARY})")
     summary = read_summary(place)

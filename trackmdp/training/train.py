@@ -18,7 +18,7 @@ from trackmdp.config.compose import compose, default, given
 from trackmdp.config.logs import require_packages
 from trackmdp.config.resume import run_folder
 from trackmdp.environment.observation import ObservationVector
-from trackmdp.errors import UserError
+from trackmdp.errors import UserError, path_of
 from trackmdp.seeding import preserved_global_rng
 from trackmdp.training.blocks import make_trainer
 from trackmdp.training.callbacks import Callback
@@ -70,10 +70,14 @@ def train(
         Preempted: a signal ended the run; with a folder it can be resumed.
     """
     check_problem(problem, "train")
-    for each in callbacks:
-        if not isinstance(each, Callback):
-            raise UserError(f"callbacks: a {type(each).__name__}, expected a Callback")
-    place = None if folder is None else Path(folder)
+    wrong = (
+        [each for each in callbacks if not isinstance(each, Callback)]
+        if isinstance(callbacks, Sequence)
+        else [callbacks]
+    )
+    if wrong:
+        raise UserError(f"callbacks: a {type(wrong[0]).__name__}, expected a list of Callback")
+    place = None if folder is None else path_of(folder, "folder")
     if place is None and options.get("log"):
         raise UserError(f"log={options['log']}: expected folder=FOLDER beside it, for its files")
     nets = _nets(problem, {"actor": actor, "critic": critic}, place)
