@@ -73,6 +73,10 @@ def check_bracket(group: Group) -> None:
         assert found.lower - 1e-9 <= merged.aihtr.mean <= best + 1e-9
 
 
+def test_an_exit_step_is_paid_where_others_are_left() -> None:
+    check_bracket(Group([World(np.array([[0, 0.5], [0.5, 0]]), (1, 2), cost=0.2, t_max=0)] * 2))
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_brute_force_lies_in_the_bracket_with_both_policies_below(seed: int) -> None:
     check_bracket(Group([tiny(seed)] * 2))

@@ -260,6 +260,18 @@ def key_visits(problem: Problem, policy: PolicyTable) -> Array:
     return per_row(events.key[:known], visits[:known], events.keys.num_keys)
 
 
+def price_at_exit(world: World, policy: PolicyTable) -> float:
+    """Expected price of what is on, or due, on the exit step, free for a single target; starts are uniform."""
+    events, found = follow(world, world.motion, policy)
+    steps = list(found)
+    located, _ = whole_renewals(steps, len(events.codes))
+    prices = [policy.spent(n, world.paid)[events.key] for n in range(world.num_choices)]
+    prices.append(np.full(len(events.codes), world.safe_cost))
+    exits = [step.totals[:, 5] - step.totals[:, 1] for step in steps]
+    paid = (np.stack(prices) * np.stack(exits)).sum(axis=0)
+    return float(RenewalSystem(located, world.size).solve(paid).mean())
+
+
 def replay(
     task: Task, tracks: Tracks, policy: PolicyTable, under: Under | None = None
 ) -> ReplayedTracks:

@@ -84,13 +84,14 @@ def _several(cfg: SolveConfig, world: World, folder: Path, at: Console) -> float
         ["one target", f"{single.lower:,.6f}"],
         ["as many separate trackers", f"{found.apart:,.6f}"],
     ]
+    if found.lower is not None:
+        rows.append(["proved: the best policy, at least", f"{found.lower:,.6f}"])
     rows.append(["proved bound on all policies", f"{found.upper:,.6f}"])
     at.print(table(f"{cfg.targets.count} targets", ["", "AIHTR"], rows))
     gap = (found.upper - found.apart) / steps
-    proof = "a lower end" if found.lower is not None else "no proved lower end"
     at.print(
-        f"separate trackers are {proof} of the bracket, {gap:.2g} per step wide; {found.seconds:.1f} s; results in "
-        f"{folder}, sets of one target in {sets_name(single.table)}; evaluate baseline=optimal values them merged"
+        f"separate trackers are {gap:.2g} per step below the bound; {found.seconds:.1f} s; results in {folder}, sets "
+        f"of one target in {sets_name(single.table)}; evaluate baseline=optimal values them merged"
     )
     if single.interrupted:
         raise KeyboardInterrupt

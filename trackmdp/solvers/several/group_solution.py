@@ -12,6 +12,7 @@ from trackmdp.solvers.several.group_bounds import sensors_suffice
 from trackmdp.solvers.several.group_tracker import GroupTracker
 from trackmdp.solvers.several.merging import Merged
 from trackmdp.solvers.solution import Solution
+from trackmdp.solvers.value import price_at_exit
 from trackmdp.world.group import Group
 
 
@@ -50,16 +51,21 @@ class GroupSolution(Carded):
         """AIHTR of as many separate trackers, each with sensors of its own."""
         return float(sum(self.singles[kind].lower for kind in self.group.kind))
 
-    @property
+    @cached_property
     def lower(self) -> float | None:
         """Proved: the best policy has no lower AIHTR.
 
-        All own sets together cost no more than `apart`, and a detection more loses nothing where all sensors can do
-        what the safe action does, and are no dearer. None where they are or cannot, a budget forbids the union, or a
-        safe action that misses may take the place of sets that would not.
+        All own sets together cost no more than apart, but for a target's exit step, paid where others are left; and a
+        detection more loses nothing where all sensors can do what the safe action does, and are no dearer. None where
+        they are or cannot, a budget forbids the union, or a safe action that misses may take the place of sets that
+        would not.
         """
         task = self.group.task
-        return self.apart if sensors_suffice(task) and task.safe else None
+        if not (sensors_suffice(task) and task.safe):
+            return None
+        kinds = zip(self.group.kinds, self.tables, strict=True)
+        exits = [price_at_exit(*each) if len(self.group) > 1 else 0.0 for each in kinds]
+        return self.apart - sum(exits[kind] for kind in self.group.kind)
 
     def card(self) -> Card:
         """The bracket."""
@@ -68,7 +74,7 @@ class GroupSolution(Carded):
             "targets": f"{len(self.group)}",
             "separate trackers": decimal(self.apart, 4),
             "upper bound": f"{decimal(self.upper, 4)}; {per_step:.2g} per step above these",
-            "proved from below": "by the union of their sets" if self.lower is not None else "no",
+            "proved from below": decimal(self.lower, 4) if self.lower is not None else "no",
             "seconds": f"{self.seconds:.2g}",
         }
         return Card(f"Solution for several targets: {grid_words(self.group.task.size)}", facts)
