@@ -175,3 +175,19 @@ def test_a_human_sees_every_step(capsys: pytest.CaptureFixture[str]) -> None:
     env.step(np.ones(env.action_space.n, np.int8))
     assert capsys.readouterr().out.count(PICTURE_LEGEND) == 2
     assert env.render() is None
+
+
+def test_a_human_sees_the_step_at_an_episodes_end_once(capsys: pytest.CaptureFixture[str]) -> None:
+    envs = gymnasium.make_vec(
+        ID,
+        num_envs=2,
+        kernel="random_walk",
+        size=3,
+        exit_probability=0.9,
+        max_steps=2,
+        render_mode="human",
+    )
+    envs.reset(seed=0)
+    ended = [envs.step(np.ones(envs.action_space.shape, np.int8))[2:4] for _ in range(3)]
+    assert np.any(ended)
+    assert capsys.readouterr().out.count(PICTURE_LEGEND) == 4

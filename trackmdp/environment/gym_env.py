@@ -72,8 +72,6 @@ class _Tracked:
 
     def _seen(self, state: TensorDictBase) -> Observation:
         """The observation in numpy, of the dtypes of its space; copies, for the tensors are the environment's own."""
-        if self.render_mode == "human":
-            self.render()
         seen = {
             key: state[key].numpy().astype(part.dtype)
             for key, part in self.observation_space.items()
@@ -82,6 +80,9 @@ class _Tracked:
         return {key: value if value.ndim else value[()] for key, value in seen.items()}
 
     def _info(self) -> dict[str, Any]:
+        """The true cells, asked for once at the end of each step, where a human sees its picture."""
+        if self.render_mode == "human":
+            self.render()
         target = self._env.target.numpy()
         return {"target": target if target.ndim else int(target)}
 
