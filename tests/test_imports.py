@@ -1,8 +1,11 @@
-"""Imports without the garbage collector."""
+"""Imports without the garbage collector, and Ctrl-C amid the first of them."""
 
 from __future__ import annotations
 
 import gc
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -39,6 +42,24 @@ def test_a_failed_import_leaves_the_collector_as_it_was() -> None:
     with importing():
         pass
     assert not gc.isenabled()
+
+
+INTERRUPTED = """
+import runpy, signal, sys
+class Interrupting:
+    def find_spec(name, *_):
+        if name == "trackmdp.untrusted":
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Interrupting)
+runpy.run_module("trackmdp", run_name="__main__")
+"""
+
+
+def test_ctrl_c_while_the_command_line_is_imported_shows_no_traceback() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
 
 
 def test_commands_leave_it_on() -> None:

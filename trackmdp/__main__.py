@@ -2,9 +2,22 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 
-from trackmdp.app.cli import main
+
+def command_line() -> int:
+    """Run `trackmdp.app.cli.main`; while that is imported, Ctrl-C ends the process without a traceback."""
+    # Another handler stays: behind `nohup` the signal is ignored.
+    default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if default:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from trackmdp.app import cli
+
+    if default:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    return cli.main()
+
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(command_line())
