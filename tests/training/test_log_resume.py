@@ -106,6 +106,20 @@ def test_it_begins_anew_where_nothing_is_saved_yet(
     assert (tmp_path / "cut/episodes.mcap").read_bytes() == (whole / "episodes.mcap").read_bytes()
 
 
+def test_a_log_that_was_taken_away_meanwhile_stays_and_another_is_begun_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cut(tmp_path / "cut", monkeypatch, closes=False, iteration=4)
+    part = tmp_path / "cut/episodes.mcap.part"
+    before = part.read_bytes()
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        at_iteration(patch, 6, killed)
+        train(tmp_path / "cut", *LOGGED[3:], "log=[]", "resume=auto")
+    train(tmp_path / "cut", *LOGGED, "resume=auto")
+    assert part.read_bytes() == before
+    assert count(tmp_path / "cut/episodes-2.mcap") == 6
+
+
 def test_a_log_that_lost_episodes_is_left_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -173,7 +173,8 @@ class EpisodeLogger(Callback):
             seed=trainer.config.seed,
             config=config_text(trainer.config, trainer.folder),
             layout=self._cfg.layout,
-            policies=self._policies,
+            # A resumed run that went on without the log meanwhile has no count of it: what it left is no beginning.
+            policies=None if trainer.start.iteration and not self._policies else self._policies,
             tell=tell,
         )
 
