@@ -16,6 +16,7 @@ from tests.solvers.worlds import (
 )
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.several import group_bounds
 from trackmdp.world.make import make_world
 from trackmdp.world.model import World
 
@@ -75,6 +76,19 @@ def test_a_safe_action_that_nobody_would_take_may_cost_anything() -> None:
     world = make_world("random_support", size=3, support_size=3, cost=0.22)
     dear, dearest = (bounds.clocked(world.but(safe_cost=price)) for price in (1e4, 1e12))
     np.testing.assert_allclose(dearest, dear, rtol=1e-9)
+
+
+def test_the_bound_of_a_pair_holds_where_values_fall_from_round_to_round() -> None:
+    """Its own equation, iterated far beyond its end."""
+    world = World(
+        np.array([[0.13, 0.14], [0.18, 0.0]]), (1, 2), cost=[0.98, 0.69], safe_cost=1e3, t_max=0
+    )
+    pair = group_bounds._Paired(world, world)
+    table = np.zeros((2, 3, 2))
+    for _ in range(100):
+        table = pair._round(table)
+    assert (pair.value >= table[:, :-1, 0]).all()
+    np.testing.assert_allclose(pair.value, table[:, :-1, 0], atol=1e-5)
 
 
 def test_a_probability_equal_to_the_threshold_is_sensed_whatever_its_rounding() -> None:

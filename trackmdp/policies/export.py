@@ -134,6 +134,8 @@ def to_onnx(policy: PolicyTable, _: Array | None, about: dict[str, str]) -> byte
 
 
 def _to_sets(policy: PolicyTable, *_: object) -> bytes:
+    if not policy.deterministic:
+        raise UserError("export: the policy draws its sets at random: no list has them")
     if not listable(policy):
         raise UserError(
             "export: too many sets for a .json; `trackmdp export format=sets` writes them as .npz"

@@ -16,6 +16,7 @@ import trackmdp as tm
 from tests.training.runs import train
 from trackmdp.app.cli import main
 from trackmdp.arrays.types import BoolArray
+from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import read_sets
 from trackmdp.training.run import trained
@@ -184,6 +185,11 @@ def test_mistakes_end_in_one_line(
     assert main(["export", *(word.format(run=run) for word in words)]) == 2
     assert re.fullmatch(f"trackmdp export: {told}\n", capsys.readouterr().err)
     assert not list(tmp_path.iterdir())
+
+
+def test_sets_that_are_drawn_are_no_list(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="draws its sets"):
+        tm.export(Policy.random_k(tm.make_world(size=3), 2), tmp_path / "sets.json")
 
 
 def test_onnx_is_asked_for_by_name(

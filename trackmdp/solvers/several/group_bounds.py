@@ -98,10 +98,15 @@ class _Paired:
         longest = float(expected_steps(world).max()) if most is None else float(most)
         for number in itertools.count(1):
             after = self._round(table)
-            change = float((after - table).max())
+            # Where all values fall none of the falls is a bound on those to come; 0 is one.
+            change = max(float((after - table).max()), 0.0)
+            fall, size = (each.max(axis=(0, 1)) for each in (table - after, np.abs(after)))
+            # beside a large D changes do not settle below rounding
+            enough = _ENOUGH + 1e-14 * float(size.max())
             table = after
             # The most that all further rounds add, as every round is a step of this target in the grid.
-            if change <= _ENOUGH or number == most:
+            settled = change <= enough and bool((fall <= enough + _ENOUGH * size).all())
+            if settled or number == most:
                 break
         return table[:, :-1, 0] + (0.0 if number == most else change * longest)
 
