@@ -73,6 +73,11 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"algo": "model_based", "algo.warm_up": 1},
         "algo.warm_up=1: without effect with algo.sensing=null",
     ),
+    ({"grid.cell": 10}, "grid.cell=10: without effect without grid.origin"),
+    (
+        {"kernel.support_size": 1, "kernel.low_probability": 0.2},
+        "kernel.low_probability=0.2: without effect with support_size=1",
+    ),
     ({"algo.lr": 0.5}, "algo.lr: renamed, expected algo.learning_rate"),
 ]
 

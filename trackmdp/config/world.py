@@ -79,6 +79,11 @@ class GridConfig(NodeConfig):
                 if getattr(self, name) is not None and getattr(self, needed) is None:
                     raise UserError(f"{key}.{needed}: missing, expected beside {key}.{name}")
 
+    def ignored(self, root: Any) -> dict[str, str]:
+        """The side of a cell, of a grid without a place whose motion is not in metres."""
+        metres = not root.kernel.is_motion or hasattr(root.kernel, "cell")
+        return {} if metres or self.origin else {"cell": "without grid.origin"}
+
     @property
     def place(self) -> dict[str, Any]:
         """Side of a cell, corner and projection."""
@@ -175,6 +180,10 @@ class RandomSupportConfig(ExitingConfig):
         if self.low_probability + self.exit_probability >= 1:
             expected = f"less than 1 - {key}.exit_probability = {1 - self.exit_probability:g}"
             raise refuse(f"{key}.low_probability", self.low_probability, expected)
+
+    def ignored(self, root: Any) -> dict[str, str]:
+        """A single position has all of the probability."""
+        return {"low_probability": "with support_size=1"} if self.support_size == 1 else {}
 
 
 @choice("kernel", "random_walk", makes="trackmdp.motion.kernels:random_walk")
