@@ -112,6 +112,7 @@ PLACED = problem_arrays(placed())
         npz_bytes(PLACED | {"place.more": np.int64(1)}),
         npz_bytes(ARRAYS | {"tracks.first": np.array([0, 3, 99])}),
         npz_bytes(ARRAYS | {"tracks.first": np.array([0, 5, 4])}),
+        npz_bytes(ARRAYS | {"held_out.first": ARRAYS["held_out.first"].astype(np.uint64)}),
         npz_bytes(ARRAYS | {"held_out.names": np.array([1, 2])}),
         npz_bytes(ARRAYS | {"held_out.exits": np.array([{}], dtype=object)}),
         npz_bytes(problem_arrays(small_world()) | {"kernel.indices": np.full(81, 99)}),

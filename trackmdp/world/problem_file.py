@@ -186,8 +186,9 @@ def _check_tracks(tracks: Tracks, num_cells: int) -> None:
     begins = tracks.begins
     if begins is not None and not (begins.shape == tracks.exits.shape and (begins >= 0).all()):
         raise ValueError(f"begins {begins.shape} of {len(tracks)} tracks")
-    if tracks.cells.dtype != np.int64 or tracks.exits.dtype != bool:
-        raise ValueError(f"cells of {tracks.cells.dtype}, exits of {tracks.exits.dtype}")
+    whole_numbers = [tracks.cells, tracks.first, *([] if begins is None else [begins])]
+    if any(each.dtype != np.int64 for each in whole_numbers) or tracks.exits.dtype != bool:
+        raise ValueError("cells, first, begins or exits of another type")
     if not ((tracks.cells >= 0) & (tracks.cells < num_cells)).all():
         raise ValueError(f"a cell outside the grid of {num_cells} cells")
 
