@@ -12,6 +12,7 @@ import torch
 from scipy import sparse
 
 from tests.helpers import advanced, small_world
+from trackmdp import machine
 from trackmdp.app.cli import main
 from trackmdp.config.sensors import lattice
 from trackmdp.environment.dynamics import Dynamics
@@ -60,6 +61,13 @@ def test_discs_on_a_lattice() -> None:
     assert footprint((4, 5), radius=1e308, spacing=2, **certain)["coverage"].matrix.nnz == 6 * 20
 
 
+def test_discs_that_do_not_fit_into_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """500 x 500 sensors, each with a disc of 785,349 places, most of them outside of the grid."""
+    monkeypatch.setattr(machine, "free_bytes", lambda: 2**36)
+    with pytest.raises(UserError, match=r"^sensor\.radius=500\.0: needs about 5,4"):
+        footprint(500, radius=500.0, spacing=1, path=None, p_d=1.0, p_s=1.0)
+
+
 def test_steps_by_hand() -> None:
     env = TrackEnv(_line(), 3)
     assert env.action_spec.shape == (3, 2)
@@ -96,6 +104,12 @@ def test_the_environment_and_simulation_earn_the_exact_value() -> None:
     )
     share = located.sum() / (~steps["next", "terminated"]).sum()
     assert share.item() == pytest.approx(evaluate(world, policy).accuracy, abs=0.01)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_subset_is_empty_where_a_window_has_no_sensor() -> None:
+    world = World(LINE, (1, 4), cost=[0.1, 0.1, np.nan, np.nan], t_max=1, window=0)
+    assert np.diff(Policy.random_k(world, 1).written.indptr).tolist() == [1, 1, 1, 1, 0, 0, 0, 0]
 
 
 @pytest.mark.parametrize("k", [0, 2, 3])

@@ -111,7 +111,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
         assert near is not None
         count = np.diff(near.indptr)
         # Each sensor's own probability of being among the k of its window.
-        share = np.repeat(np.minimum(k / count, 1.0), count)
+        share = np.minimum(k / np.repeat(count, count), 1.0)
         return cls(task, with_data(near, share), k=k)
 
     @classmethod
