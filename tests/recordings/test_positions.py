@@ -395,6 +395,13 @@ def test_columns_and_frames_are_those_of_a_table(tmp_path: Path, format: str) ->
         tm.load_tracks(pd.DataFrame(), format=format, **OPTIONS)
 
 
+@pytest.mark.parametrize("again", ["x", "X", "TIME"])
+def test_a_column_that_is_there_twice_is_refused(tmp_path: Path, again: str) -> None:
+    with pytest.raises(UserError, match=f"two columns called {again},"):
+        read(tmp_path, f"id,time,x,y,{again}\n1,2,3,4,5\n")
+    assert len(read(tmp_path, "id,time,x,y,v,V\n1,2,3,4,5,6\n").time) == 1
+
+
 @pytest.mark.parametrize("named", ["x", "lon"])
 def test_of_a_table_with_x_y_and_lat_lon_those_that_are_named_count(named: str) -> None:
     table = pd.DataFrame({"id": [1], "t": 0, "x": 2.0, "y": 3.0, "lon": 8.5, "lat": 47.5})

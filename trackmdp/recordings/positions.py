@@ -207,9 +207,10 @@ def _chosen_columns(names: Iterable[str], own: Sequence[str]) -> dict[str, str]:
     """Our name -> the name in the file, of id, time and then the position.
 
     Raises:
-        ValueError: one is missing, or there are both x, y and lon, lat.
+        ValueError: one is missing or there twice, or there are both x, y and lon, lat.
     """
-    known = {name.strip().lower(): name for name in names}
+    lowered = [(name.strip().lower(), name) for name in names]
+    known = dict(lowered)
     usual = ALIASES | {
         name: (column.lower(),) for name, _, column in (each.partition(":") for each in own)
     }
@@ -227,7 +228,11 @@ def _chosen_columns(names: Iterable[str], own: Sequence[str]) -> dict[str, str]:
         wanted = [*missing, *(["either x, y or lat, lon"] if len(pairs) != 1 else [])]
         hint = "" if own else ", or kernel.columns=[id:NAME,...]"
         raise ValueError(f"columns {', '.join(known)[:80]}: expected {' and '.join(wanted)}{hint}")
-    return {name: str(found[name]) for name in ("id", "time", *pairs[0])}
+    chosen = {name: str(found[name]) for name in ("id", "time", *pairs[0])}
+    for name in chosen.values():
+        if sum(name.strip().lower() == other for other, _ in lowered) > 1:
+            raise ValueError(f"two columns called {name.strip()}, in small letters or capitals")
+    return chosen
 
 
 def _read_csv(stream: BinaryIO, names: Sequence[str], columns: Mapping[str, str]) -> Any:
