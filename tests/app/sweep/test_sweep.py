@@ -9,22 +9,19 @@ import re
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from rich.console import Console
 
-from tests.app.sweep.runs import ROOT, TINY, here, runs_of, started, states, swept, table
+from tests.app.sweep.runs import ROOT, TINY, here, runs_of, states, swept, table
 from tests.typed import stub
 from trackmdp.app.cli import main
-from trackmdp.app.sweep.plan import Job
-from trackmdp.app.sweep.process import stop_signal
-from trackmdp.app.sweep.sweep import show_runs, sweep, write_table
+from trackmdp.app.sweep.sweep import show_runs, write_table
 from trackmdp.durable import write_sealed
-from trackmdp.errors import Preempted, RunError, UserError
+from trackmdp.errors import Preempted, RunError
 from trackmdp.reports.gather import planned
 from trackmdp.training.folders import RunState, run_of, write_plan
 from trackmdp.training.lock import locked
@@ -275,78 +272,6 @@ def test_states_of_a_run(tmp_path: Path) -> None:
     assert run_of(folder).state == "failed"
     write_sealed(folder / "summary.json", {"policy": {}})
     assert run_of(folder).state == "done"
-
-
-def test_a_launcher_that_is_refused_is_not_asked_again(tmp_path: Path) -> None:
-    asked: list[str] = []
-
-    def launch(jobs: Sequence[Job]) -> None:
-        asked.extend(job.name for job in jobs)
-        raise UserError("hydra.launcher.address=x:1: expected a Ray cluster")
-
-    with pytest.raises(UserError, match="expected a Ray cluster"):
-        sweep(
-            tmp_path,
-            "train",
-            "a line",
-            [[Job("train", tmp_path, "one", (), None)]],
-            launch,
-            Console(quiet=True),
-        )
-    assert asked == ["one"]
-
-
-def test_a_signal_is_told_to_the_runs_and_ends_the_sweep(tmp_path: Path) -> None:
-    one, two = (Job("train", tmp_path, name, (), None) for name in ("one", "two"))
-    before, seen = signal.getsignal(signal.SIGTERM), []
-
-    def launch(jobs: Sequence[Job]) -> None:
-        signal.raise_signal(signal.SIGTERM)
-        seen.append(
-            (
-                [job.name for job in jobs],
-                stop_signal(tmp_path),
-                signal.getsignal(signal.SIGTERM) == before,
-            )
-        )
-
-    with pytest.raises(Preempted) as told:
-        sweep(tmp_path, "train", "a line", [[one], [two]], launch, Console(quiet=True))
-    assert seen == [(["one"], signal.SIGTERM, False)]  # a second one is taken as well
-    assert (told.value.signal, stop_signal(tmp_path), signal.getsignal(signal.SIGTERM)) == (
-        signal.SIGTERM,
-        0,
-        before,
-    )
-    assert states(tmp_path) == ["waiting"]
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
-def test_runs_outlive_their_fork_server(here: Path) -> None:
-    more = ["collector.total_frames=200_000", "seed=0,1", "hydra.sweep.dir=all"]
-    process = started(
-        here, "train", "-m", *(word for word in TINY if "total_frames" not in word), *more
-    )
-    for run in range(2):  # the server is killed while each of the two runs goes on
-        until = time.monotonic() + 120
-        while len(list((here / "all").glob("*/config.yaml"))) <= run and time.monotonic() < until:
-            time.sleep(0.02)
-        servers = [
-            int(path.parent.name)
-            for path in Path("/proc").glob("[0-9]*/cmdline")
-            if b"forkserver import main" in path.read_bytes()
-            and _parent(path.parent) == process.pid
-        ]
-        assert len(servers) == 1
-        os.kill(servers[0], signal.SIGKILL)
-    _, said = process.communicate(timeout=240)
-    assert (process.returncode, said) == (0, "")
-    assert states(here / "all") == ["done", "done"]
-
-
-def _parent(process: Path) -> int:
-    return int((process / "stat").read_text().rpartition(")")[2].split()[1])
 
 
 def test_the_table_holds_no_formulas(tmp_path: Path) -> None:

@@ -1,0 +1,92 @@
+"""A sweep that ends early, or whose parts do: a refused launcher, a signal, a dead fork server."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from tests.app.sweep.runs import TINY, here, started, states
+from trackmdp.app.sweep.plan import Job
+from trackmdp.app.sweep.process import stop_signal
+from trackmdp.app.sweep.sweep import sweep
+from trackmdp.errors import Preempted, UserError
+
+__all__ = ["here"]
+
+
+def test_a_launcher_that_is_refused_is_not_asked_again(tmp_path: Path) -> None:
+    asked: list[str] = []
+
+    def launch(jobs: Sequence[Job]) -> None:
+        asked.extend(job.name for job in jobs)
+        raise UserError("hydra.launcher.address=x:1: expected a Ray cluster")
+
+    with pytest.raises(UserError, match="expected a Ray cluster"):
+        sweep(
+            tmp_path,
+            "train",
+            "a line",
+            [[Job("train", tmp_path, "one", (), None)]],
+            launch,
+            Console(quiet=True),
+        )
+    assert asked == ["one"]
+
+
+def test_a_signal_is_told_to_the_runs_and_ends_the_sweep(tmp_path: Path) -> None:
+    one, two = (Job("train", tmp_path, name, (), None) for name in ("one", "two"))
+    before, seen = signal.getsignal(signal.SIGTERM), []
+
+    def launch(jobs: Sequence[Job]) -> None:
+        signal.raise_signal(signal.SIGTERM)
+        seen.append(
+            (
+                [job.name for job in jobs],
+                stop_signal(tmp_path),
+                signal.getsignal(signal.SIGTERM) == before,
+            )
+        )
+
+    with pytest.raises(Preempted) as told:
+        sweep(tmp_path, "train", "a line", [[one], [two]], launch, Console(quiet=True))
+    assert seen == [(["one"], signal.SIGTERM, False)]  # a second one is taken as well
+    assert (told.value.signal, stop_signal(tmp_path), signal.getsignal(signal.SIGTERM)) == (
+        signal.SIGTERM,
+        0,
+        before,
+    )
+    assert states(tmp_path) == ["waiting"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
+def test_runs_outlive_their_fork_server(here: Path) -> None:
+    more = ["collector.total_frames=200_000", "seed=0,1", "hydra.sweep.dir=all"]
+    process = started(
+        here, "train", "-m", *(word for word in TINY if "total_frames" not in word), *more
+    )
+    for run in range(2):  # the server is killed while each of the two runs goes on
+        until = time.monotonic() + 120
+        while len(list((here / "all").glob("*/config.yaml"))) <= run and time.monotonic() < until:
+            time.sleep(0.02)
+        servers = [
+            int(path.parent.name)
+            for path in Path("/proc").glob("[0-9]*/cmdline")
+            if b"forkserver import main" in path.read_bytes()
+            and _parent(path.parent) == process.pid
+        ]
+        assert len(servers) == 1
+        os.kill(servers[0], signal.SIGKILL)
+    _, said = process.communicate(timeout=240)
+    assert (process.returncode, said) == (0, "")
+    assert states(here / "all") == ["done", "done"]
+
+
+def _parent(process: Path) -> int:
+    return int((process / "stat").read_text().rpartition(")")[2].split()[1])
