@@ -58,7 +58,7 @@ def test_exact_and_simulated_figures_agree_for_a_learned_actor() -> None:
         actor.module[0].module.network.head.weight.normal_(std=0.3)
     mode = Policy.from_module(world, actor)
     simulation = simulate(world, mode, 10_000).figures()
-    assert simulation.safe_per_episode.mean > 0.05
+    assert simulation.safe_per_episode.mean > 0.03
     assert 0.2 < simulation.accuracy.mean < 0.9
     assert_close(world, mode, simulation)
 
