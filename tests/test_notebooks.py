@@ -21,9 +21,7 @@ def shown(outputs: list[dict[str, Any]]) -> list[str]:
         data = each.get("data", {})
         text = "".join(each.get("text", data.get("text/plain", [])))
         kinds = " ".join(sorted(data))
-        found.append(
-            f"{each['output_type']} {kinds} {re.sub(r'[-–]?[0-9.,]+(e[-+]?[0-9]+)?|nan|NaN', '#', text)}"
-        )
+        found.append(f"{each['output_type']} {kinds} {re.sub(r'[-–]?[0-9.,]+|nan|NaN', '#', text)}")
     return [re.sub(r"\s+", " ", each) for each in found]
 
 

@@ -52,13 +52,13 @@ def test_exact_and_simulated_figures_agree_for_every_baseline(
 
 def test_exact_and_simulated_figures_agree_for_a_learned_actor() -> None:
     world = small_world(t_max=2, exit_probability=0.3)
-    torch.manual_seed(0)
+    torch.manual_seed(1)
     actor = algorithm("ppo", world).actor
     with torch.no_grad():
         actor.module[0].module.network.head.weight.normal_(std=0.3)
     mode = Policy.from_module(world, actor)
     simulation = simulate(world, mode, 10_000).figures()
-    assert simulation.safe_per_episode.mean > 0.03
+    assert simulation.safe_per_episode.mean > 0.05
     assert 0.2 < simulation.accuracy.mean < 0.9
     assert_close(world, mode, simulation)
 

@@ -65,10 +65,6 @@ class StateEncoder(nn.Module):
         self.register_state_dict_post_hook(_split)
         self.register_load_state_dict_pre_hook(_joined)
 
-    def parts(self) -> dict[str, Tensor]:
-        """The rows of each part of the table, by its name: views `[count, hidden]`."""
-        return dict(zip(self._parts, self.table.split(list(self._parts.values())), strict=True))
-
     def forward(
         self,
         last_cell: Tensor,
@@ -93,12 +89,10 @@ class StateEncoder(nn.Module):
 
 
 def _split(encoder: StateEncoder, state: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Name the parts of the table in a state dict."""
-    table = state.pop(f"{prefix}table")
-    parts = table.split(list(encoder._parts.values()))
-    state.update(
-        {f"{prefix}{name}": part for name, part in zip(encoder._parts, parts, strict=True)}
-    )
+    """Name the parts of the table in a state dict, views of it."""
+    parts = state.pop(f"{prefix}table").split(list(encoder._parts.values()))
+    for name, part in zip(encoder._parts, parts, strict=True):
+        state[f"{prefix}{name}"] = part
 
 
 def _joined(encoder: StateEncoder, state: dict[str, Any], prefix: str, *_: Any) -> None:
