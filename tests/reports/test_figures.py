@@ -275,7 +275,20 @@ def test_without_matplotlib_one_line_names_the_extra(
 
 
 def test_files_are_named_after_their_titles() -> None:
-    assert figures.slug("a2c, gamma=0.9-Z=5, c=0.16") == "a2c-gamma-0-9-z-5-c-0-16"
+    assert figures.slug("a2c, gamma=0.9, Z=5, c=0.16") == "a2c-gamma-0-9-z-5-c-0-16"
     assert "/" not in figures.slug("kernel=table, path=/a/b")
+    alike = ("path=A.npy", "path=a.npy", "path=a/npy", "origin=-1x2", "origin=1x2")
+    assert len({figures.slug(f"table, {each}") for each in alike}) == len(alike)
     one, other = (figures.slug("\U00020000" * 5_000 + end) for end in "ab")
     assert one != other and len(one.encode()) < 200
+
+
+def test_a_path_that_reads_like_a_price_is_a_panel_of_its_own() -> None:
+    paths = [{"kernel.name": "table", "kernel.path": f"a, c={n}.npy"} for n in (2, 3)]
+    runs = [
+        run(f"{path}{c}", options=path | {"cost.sensor": c}) for path in paths for c in (0.1, 0.2)
+    ]
+    found = study(runs)
+    assert [[*worlds] for _, worlds in figures.panels(found)] == [[0.1, 0.2], [0.1, 0.2]]
+    drawn = [world for _, worlds in figures.panels(found) for world in worlds.values()]
+    assert sorted(drawn) == sorted(found.worlds)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -118,21 +119,29 @@ def panels(study: Study) -> list[Panel]:
     for world in study.worlds:
         price = study.in_world(world)[0].settings.get("cost.sensor")
         if isinstance(price, (int, float)):
-            # The worlds of a panel share the label without its price.
-            rest = ", ".join(part for part in world.split(", ") if not part.startswith("c="))
-            groups.setdefault(rest, {})[float(price)] = world
+            # The worlds of a panel share the label without its price; a name may have a later part like it.
+            parts = world.split(", ")
+            parts.remove(next(part for part in parts if part.startswith("c=")))
+            groups.setdefault(", ".join(parts), {})[float(price)] = world
     return [
         (title, dict(sorted(priced.items()))) for title, priced in groups.items() if len(priced) > 1
     ]
 
 
+_PLAIN = re.compile(r"(\w+(=[a-z\d_.]+)?(, |$))+")
+"""A title of choices and numbers."""
+
+
 def slug(title: str) -> str:
-    """A title as part of a file name, of which systems take 255 bytes."""
+    """A title as part of a file name, of which systems take 255 bytes; titles that differ have names that differ."""
     letters = "".join(each if each.isalnum() else "-" for each in title.lower())
-    kept = "-".join(filter(None, letters.split("-"))) or "all"
-    if len(kept.encode()) <= 200:
+    kept = "-".join(filter(None, letters.split("-")))
+    if len(kept.encode()) > 200:
+        kept = kept[:40]
+    elif _PLAIN.fullmatch(title):
         return kept
-    return f"{kept[:40]}-{hashlib.sha256(title.encode()).hexdigest()[:8]}"
+    # Capitals and signs are lost, as of path=A.npy and path=a.npy, or origin=-1x2 and origin=1x2.
+    return f"{kept}-{hashlib.sha256(title.encode()).hexdigest()[:8]}"
 
 
 def against_price(study: Study, panel: Panel, key: str, threshold: float | None) -> Figure | None:

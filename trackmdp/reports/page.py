@@ -192,7 +192,7 @@ def _maps(drawn: Sequence[Mapped]) -> list[Part]:
         return []
     ends = maps.shades(maps.missing(group) for group in worlds.values())
     values = [maps.missing_map(figures.slug(w), group, ends) for w, group in worlds.items()]
-    sets = [maps.policy_map(figures.slug(f"{each.method}-{each.world}"), each) for each in drawn]
+    sets = [maps.policy_map(figures.slug(f"{each.method}, {each.world}"), each) for each in drawn]
     large = any(len(each.value) > maps.MOST_MAP_CELLS for each in drawn)
     return [_prose("missing"), values, "" if large else _prose("sets"), sets]
 
