@@ -60,7 +60,16 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"kernel": "table"}, "kernel.path: missing, expected a path"),
     ({"kernel": "given"}, "kernel.reveals: missing, expected a problem made in Python"),
     ({"sensor": "given"}, "sensor.wide: missing, expected a problem made in Python"),
-    ({"credit": "per_sensor"}, "credit: renamed, expected algo=a2c_per_sensor"),
+    (
+        {"algo": "a2c", "algo.credit": "per_sensor"},
+        "algo.credit: renamed, expected algo=a2c_per_sensor",
+    ),
+    ({"kernel.homogeneous": True}, "kernel.homogeneous: renamed, expected algo.share_cells"),
+    ({"lr": 0.5}, "lr: renamed, expected algo.learning_rate"),
+    (
+        {"log": "mcap", "log.layout": True},
+        "log.layout: unknown option, did you mean log.mcap.layout?",
+    ),
     (
         {"algo": "hindsight", "algo.explore.until": 0.3},
         "algo.explore.until=0.3: without effect with algo.collect=all_on",

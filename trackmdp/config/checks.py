@@ -20,14 +20,18 @@ from trackmdp.errors import UserError
 _T = TypeVar("_T")
 
 RENAMED: dict[str, str] = {
+    "algo.average": "algo.ema_decay",
+    "algo.credit": "algo=a2c_per_sensor",
+    "algo.lam": "algo.gae_lambda",
     "algo.lr": "algo.learning_rate",
     "algo=learned_kernel": "algo=model_based",
     "algo=path_counts": "algo=model_based",
-    "credit": "algo=a2c_per_sensor",
     "kernel.cell": "grid.cell",
     "kernel.crs": "grid.crs",
+    "kernel.homogeneous": "algo.share_cells",
     "kernel.origin": "grid.origin",
     "log.every": "log.csv.every",
+    "lr": "algo.learning_rate",
 }
 """Former or usual name of an option, or of a choice -> its name."""
 
@@ -56,6 +60,8 @@ def unknown_option(key: str, known: Mapping[str, Option]) -> UserError:
         for each, schema in GROUPS.get(group, {}).items()
         if name in options(schema) or (each == beneath and own in options(schema))
     ]
+    if full := next((x for each in others if (x := f"{group}.{each}.{name}") in known), None):
+        return UserError(f"{key}: unknown option, did you mean {full}?")
     if others:
         choices = " or ".join(f"{group}={each}" for each in others)
         return UserError(f"{key}: an option of another choice, expected {choices} beside it")
