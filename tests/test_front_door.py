@@ -168,8 +168,19 @@ def test_a_map_of_numbers_is_taken_as_the_grid_has_it(name: str) -> None:
 def test_an_argument_of_another_kind_is_one_line() -> None:
     with pytest.raises(UserError, match=r"a ndarray, expected a name; World\(kernel, size"):
         tm.make_world(np.eye(9))  # type: ignore[arg-type]
+    with pytest.raises(UserError, match="^make_world: kernel: a list, expected a name"):
+        tm.make_world([[0.5, 0.5], [1.0]])  # type: ignore[call-overload]
     with pytest.raises(UserError, match="a int, expected the path of a file, or a DataFrame"):
         tm.load_tracks(3)
+
+
+@pytest.mark.parametrize("name", ["kernel", "coverage", "cost"])
+def test_rows_of_different_lengths_are_one_line(name: str) -> None:
+    given: dict[str, Any] = {"kernel": np.eye(9) * 0.5, "cost": 0.1, name: [[0.1] * 9, [0.1]]}
+    with pytest.raises(UserError, match=f"^{name}: "):
+        tm.World(size=3, t_max=1, **given)
+    with pytest.raises(UserError, match="^cost: rows of different lengths, expected a table$"):
+        tm.make_world(size=3, cost=[[0.1] * 3, [0.1]])
 
 
 WORLD = tm.make_world("random_walk", size=3, exit_probability=0.2)

@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from scipy import sparse
 
 from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.config.sensors import LARGEST_PRICE
@@ -22,6 +23,18 @@ PRICES: Range = (
     "a number from 0 to 1e15, or nan where there is no sensor",
 )
 PROBABILITIES: Range = (lambda p: (p > 0) & (p <= 1), "a probability above 0, at most 1")
+
+
+def array_of(source: str, given: Any) -> Any:
+    """A table of any kind as an array, a sparse one as it is.
+
+    Raises:
+        UserError: its rows have different lengths; `source` is named at the start of the message.
+    """
+    try:
+        return given if sparse.issparse(given) else np.asarray(given)
+    except ValueError:
+        raise UserError(f"{source}: rows of different lengths, expected a table") from None
 
 
 def one_each(

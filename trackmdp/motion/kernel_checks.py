@@ -10,6 +10,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order
 
 from trackmdp.arrays.entries import ones_at, row_index, short_indices
+from trackmdp.arrays.numbers import array_of
 from trackmdp.arrays.rows import pairwise_row_sums
 from trackmdp.errors import UserError
 
@@ -21,7 +22,7 @@ def canonical_kernel(kernel: Any, source: str = "kernel") -> sparse.csr_array:
         UserError: it is no square table of real numbers, or its indices lead out of it; `source` is named at the start
             of the message.
     """
-    table = kernel if sparse.issparse(kernel) else np.asarray(kernel)
+    table = array_of(source, kernel)
     # bool, signed, unsigned, float: complex numbers would lose their imaginary part below.
     if table.dtype.kind not in "biuf":
         raise UserError(f"{source}: not a table of numbers (but of {table.dtype})")

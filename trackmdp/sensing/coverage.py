@@ -26,6 +26,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.arrays.entries import ones_at, row_index, with_data
+from trackmdp.arrays.numbers import array_of
 from trackmdp.errors import UserError
 from trackmdp.grid.displacements import cell_at
 from trackmdp.machine import check_free
@@ -223,7 +224,7 @@ def _canonical(given: Any) -> sparse.csr_array:
     Raises:
         UserError: an entry is no probability.
     """
-    table = given if sparse.issparse(given) else np.asarray(given)
+    table = array_of("coverage", given)
     if len(table.shape) != 2 or table.dtype.kind not in "biuf":
         raise UserError(
             f"coverage: {table.dtype} of shape {tuple(table.shape)}, expected a table of 0 and 1"

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from trackmdp.arrays.files import per_cell, read_matrix
-from trackmdp.arrays.numbers import PRICES, PROBABILITIES
+from trackmdp.arrays.numbers import PRICES, PROBABILITIES, array_of
 from trackmdp.config import WorldConfig
-from trackmdp.config.compose import compose, default, given
+from trackmdp.config.compose import Default, compose, default, given
 from trackmdp.config.options import GROUPS, options
 from trackmdp.config.registry import make, maker
 from trackmdp.config.sensors import lattice
@@ -131,7 +131,7 @@ def make_world(
     arguments = locals() | kernel_options
     for name in ("kernel", "targets", "kernel_options"):
         del arguments[name]
-    if hasattr(kernel, "shape"):
+    if not isinstance(kernel, str | Default):
         raise UserError(
             f"make_world: kernel: a {type(kernel).__name__}, expected a name; World(kernel, size, cost=..., t_max=...) "
             "takes a table"
@@ -332,12 +332,13 @@ def _flat(name: str, value: Any, size: Size) -> Any:
     """
     if not isinstance(value, list | np.ndarray):
         return value
-    if np.ndim(value) == 2:
-        if (found := np.shape(value)) != (grid := grid_size(size)):
+    table = array_of(name, value)
+    if table.ndim == 2:
+        if (found := table.shape) != (grid := grid_size(size)):
             raise UserError(
                 f"{name}: {found[0]} x {found[1]} numbers, expected {grid[0]} x {grid[1]}"
             )
-        value = np.ravel(value)
+        value = table.ravel()
     if isinstance(value, np.ndarray) and value.dtype.kind == "f" and value.ndim == 1:
         return [None if math.isnan(each) else each for each in value.tolist()]
     return value
