@@ -8,6 +8,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -168,7 +169,7 @@ def test_a_map_of_numbers_is_taken_as_the_grid_has_it(name: str) -> None:
 def test_an_argument_of_another_kind_is_one_line() -> None:
     with pytest.raises(UserError, match=r"a ndarray, expected a name; World\(kernel, size"):
         tm.make_world(np.eye(9))  # type: ignore[arg-type]
-    with pytest.raises(UserError, match="^make_world: kernel: a list, expected a name"):
+    with pytest.raises(UserError, match=r"^make_world: kernel: a list, expected a name"):
         tm.make_world([[0.5, 0.5], [1.0]])  # type: ignore[call-overload]
     with pytest.raises(UserError, match="a int, expected the path of a file, or a DataFrame"):
         tm.load_tracks(3)
@@ -177,9 +178,9 @@ def test_an_argument_of_another_kind_is_one_line() -> None:
 @pytest.mark.parametrize("name", ["kernel", "coverage", "cost"])
 def test_rows_of_different_lengths_are_one_line(name: str) -> None:
     given: dict[str, Any] = {"kernel": np.eye(9) * 0.5, "cost": 0.1, name: [[0.1] * 9, [0.1]]}
-    with pytest.raises(UserError, match=f"^{name}: "):
+    with pytest.raises(UserError, match=rf"^{name}: "):
         tm.World(size=3, t_max=1, **given)
-    with pytest.raises(UserError, match="^cost: rows of different lengths, expected a table$"):
+    with pytest.raises(UserError, match=r"^cost: rows of different lengths, expected a table$"):
         tm.make_world(size=3, cost=[[0.1] * 3, [0.1]])
 
 
@@ -209,6 +210,28 @@ def test_a_wrong_type_is_told_in_one_line(call: Callable[..., Any], message: str
     with pytest.raises(UserError) as caught:
         call()
     assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        ("save", tm.Policy.all_on(WORLD).save),
+        ("export", partial(tm.export, tm.Policy.all_on(WORLD))),
+        ("page", tm.simulate(WORLD, "all_on", 1).page),
+        ("video", tm.simulate(WORLD, "all_on", 1).video),
+    ],
+)
+def test_a_file_in_no_folder_is_one_line(
+    name: str, write: Callable[[Path], Any], tmp_path: Path
+) -> None:
+    folder, text = tmp_path / "a.onnx", tmp_path / "text"
+    folder.mkdir()
+    text.touch()
+    for file in (tmp_path / "no" / "a.onnx", folder, text / "a.onnx"):
+        with pytest.raises(UserError) as caught:
+            write(file)
+        expected = "expected a file in a folder that can be written to"
+        assert str(caught.value) == f"{name}: {file}, {expected}"
 
 
 def test_completion_offers_public_names_alone() -> None:

@@ -18,6 +18,10 @@ class UserError(ValueError):
     """
 
 
+class OutputError(UserError, OSError):
+    """A file that is to be written has no place; an `OSError`, since within a run its folder went away."""
+
+
 class RunError(RuntimeError):
     """A run that cannot go on: a loss that is not finite, a full disk, a worker that died.
 
@@ -51,6 +55,20 @@ def path_of(given: object, name: str) -> Path:
     if not isinstance(given, (str, os.PathLike)):
         raise UserError(f"{name}: a {type(given).__name__}, expected a path")
     return Path(given)
+
+
+def output_of(given: object, name: str) -> Path:
+    """The path of a file that `name` is to write.
+
+    Raises:
+        UserError: it is none.
+        OutputError: it is a folder, or lies in no folder that can be written to.
+    """
+    path = path_of(given, name)
+    # With the dot a file is not taken for a folder.
+    if path.is_dir() or not os.access(f"{path.parent}/.", os.W_OK | os.X_OK):
+        raise OutputError(f"{name}: {path}, expected a file in a folder that can be written to")
+    return path
 
 
 def message_of(error: BaseException) -> str:

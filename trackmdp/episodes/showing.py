@@ -12,7 +12,7 @@ from tensordict import TensorDict
 
 from trackmdp.durable import write_text
 from trackmdp.episodes.episode import Recording
-from trackmdp.errors import UserError
+from trackmdp.errors import UserError, output_of
 from trackmdp.notebook.card import Carded
 
 R = TypeVar("R", bound=Recording)
@@ -84,11 +84,11 @@ class Showing(Carded, Sequence[R]):
         """Write an episode as a web page that needs no network, and return its path.
 
         Raises:
-            UserError: there is no such episode.
+            UserError: there is no such episode, or the file cannot be written there.
         """
         from trackmdp.episodes.episode_page import page
 
-        place = Path(file)
+        place = output_of(file, "page")
         write_text(place, page(self.problem, self._shown("page", number)))
         return place
 
@@ -96,9 +96,11 @@ class Showing(Carded, Sequence[R]):
         """Write an episode as a `.gif` or `.mp4` of `speed` steps per second, and return its path (extra `video`).
 
         Raises:
-            UserError: there is no such episode, another ending, or a package is missing.
+            UserError: there is no such episode, the file cannot be written there, another ending, or a package is
+                missing.
         """
         from trackmdp.episodes.video import write_video
 
-        write_video(Path(file), self.problem.single, self._shown("video", number), speed)
-        return Path(file)
+        place = output_of(file, "video")
+        write_video(place, self.problem.single, self._shown("video", number), speed)
+        return place

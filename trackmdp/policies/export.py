@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from trackmdp import __version__
 from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.durable import write_bytes
-from trackmdp.errors import UserError, path_of, require
+from trackmdp.errors import UserError, output_of, require
 from trackmdp.policies.forms import adapted
 from trackmdp.policies.geojson import map_features
 from trackmdp.policies.saved import listable
@@ -46,9 +46,10 @@ def export(policy: Any, file: str | Path, *, value: Array | None = None, label: 
         label: name of the policy, for the metadata.
 
     Raises:
-        UserError: the ending is unknown, a package is missing, the policy draws its sets or is too large.
+        UserError: the file cannot be written there, its ending is unknown, a package is missing, the policy draws its
+            sets or is too large.
     """
-    place, table = path_of(file, "export"), adapted(None, policy)
+    place, table = output_of(file, "export"), adapted(None, policy)
     if not isinstance(table, PolicyTable):
         raise UserError(
             f"export: a {type(policy).__name__}, expected a policy of one target: a Policy, a Run or a Solution"

@@ -23,7 +23,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from trackmdp.arrays.entries import with_data
 from trackmdp.arrays.types import Array
-from trackmdp.errors import UserError, path_of
+from trackmdp.errors import UserError, output_of, path_of
 from trackmdp.policies.forms import (
     STATE_KEYS,
     acting,
@@ -270,8 +270,12 @@ class Policy(TensorDictModuleBase, PolicyTable):
     # Files.
 
     def save(self, file: str | Path, value: Array | None = None) -> None:
-        """Write `policy.npz`; see `trackmdp.policies.saved`."""
-        save_policy(path_of(file, "save"), self, value)
+        """Write `policy.npz`; see `trackmdp.policies.saved`.
+
+        Raises:
+            UserError: the file cannot be written there.
+        """
+        save_policy(output_of(file, "save"), self, value)
 
     @classmethod
     def load(cls, file: str | Path) -> Policy:

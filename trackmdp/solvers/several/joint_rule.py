@@ -17,7 +17,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from trackmdp.arrays.files import npz_bytes
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.durable import write_bytes
-from trackmdp.errors import UserError
+from trackmdp.errors import UserError, output_of
 from trackmdp.solvers.several.group_tracker import GroupTracker
 from trackmdp.solvers.several.merging import Beliefs, Clocks, Rule
 from trackmdp.world.group import Group
@@ -90,4 +90,4 @@ class JointRule(Rule):
 
     def save(self, file: Path, value: Array | None = None) -> None:  # noqa: ARG002 (there is none)
         """Write `packed`; the same weights, the same bytes."""
-        write_bytes(file, npz_bytes(self.packed()[0]))
+        write_bytes(output_of(file, "save"), npz_bytes(self.packed()[0]))
