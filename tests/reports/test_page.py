@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from tests.episodes.browser import CHROMIUM, Browser
-from tests.reports.sweeps import write_run
+from tests.reports.sweeps import write_run, write_sweep
+from tests.reports.test_gather import plan
 from tests.tracks import by_hand, recorded
 from trackmdp.config.compose import compose
 from trackmdp.paper.calibration import Openings, candidates, checks, sensitivity
@@ -249,3 +251,17 @@ def test_the_page_in_a_browser(report: Report, browser: Browser, tmp_path: Path)
     assert browser.ask(f"{HEADS}[{regret}].hasAttribute('aria-sort')") is False
     assert browser.ask(f"{HEADS}[0].getAttribute('aria-sort')") == "ascending"
     assert browser.problems == []
+
+
+def test_runs_of_an_earlier_line_count_as_planned_but_copies_do_not(tmp_path: Path) -> None:
+    sweep = write_sweep(tmp_path / "sweep")
+    shutil.copytree(sweep / "a2c-0.22-0", sweep / "z")
+    names = sorted(path.name for path in sweep.iterdir())
+    plan(sweep, *names[:2], "ppo-0.16-0")  # the second line, in the folder of the first
+    page = build(gather_runs(sweep)).html()
+    assert "12 of 13 planned runs" in page
+    assert "<dt>Last command</dt>" in page
+    plan(sweep, *names[:12])
+    page = build(gather_runs(sweep)).html()
+    assert "12 of 12 planned runs" in page
+    assert "<dt>Command</dt>" in page

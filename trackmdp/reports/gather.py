@@ -35,22 +35,22 @@ def gather_runs(folder: Path) -> Results:
         raise UserError(
             f"sweep={folder}: no runs in there, expected the folder of a sweep or of stored results"
         )
-    anomalies: list[Anomaly] = []
+    lost: list[Anomaly] = []
+    copies: list[Anomaly] = []
     found: dict[str, tuple[FinishedRun, Mapping[str, Any]]] = {}  # by the digest of the config
     for name in names:
         try:
             run, summary = _read(folder / name, name)
         except UserError as error:
-            anomalies.append(_anomaly(folder, name, error))
+            lost.append(_anomaly(folder, name, error))
             continue
         first, _ = found.setdefault(str(summary["config_sha256"]), (run, summary))
         if first is not run:  # a copied folder would count one seed twice
-            anomalies.append(Anomaly(name, f"the same config as {first.name}, which counts"))
+            copies.append(Anomaly(name, f"the same config as {first.name}, which counts"))
     runs, summaries = [run for run, _ in found.values()], [each for _, each in found.values()]
-    anomalies += _other_versions(runs, summaries)
-    grouped = study(runs)
-    maps, unread = _maps(folder, grouped)
-    return Results(runs, maps, [*anomalies, *unread], _manifest(plan, runs, summaries))
+    maps, unread = _maps(folder, study(runs))
+    anomalies = [*lost, *copies, *_other_versions(runs, summaries), *unread]
+    return Results(runs, maps, anomalies, _manifest(plan, len(lost), runs, summaries))
 
 
 def planned(folder: Path) -> Mapping[str, Any] | None:
@@ -161,6 +161,7 @@ def _from_the_middle(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
 
 def _manifest(
     plan: Mapping[str, Any] | None,
+    lost: int,
     runs: Sequence[FinishedRun],
     summaries: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
@@ -169,9 +170,12 @@ def _manifest(
     with suppress(ValueError):  # a line that no sweep wrote: quotes without an end
         words = shlex.split(printable(str(plan.get("line", "")))) if plan else []
     folders = ("hydra.sweep.dir=", "hydra.run.dir=")
+    # The plan is of the last line typed in the folder, which may hold runs of earlier ones.
+    planned = len(runs) + lost if plan else None
     return {
         "line": shlex.join(word for word in words if not word.startswith(folders)),
-        "planned": len(plan["jobs"]) if plan else None,
+        "planned": planned,
+        "last": bool(plan and planned and planned > len(plan["jobs"])),
         "wall_seconds": sum(run.figure("wall_seconds") for run in runs),
         "cpu_seconds": sum(run.figure("cpu_seconds") for run in runs),
         "versions": _counted(summary.get("versions") for summary in summaries),

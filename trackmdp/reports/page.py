@@ -203,7 +203,8 @@ def _runs(grouped: Study, threshold: float | None) -> list[Part]:
 
 
 def _made(manifest: Mapping[str, Any]) -> dict[str, str]:
-    facts = {"Command": manifest.get("line") or "not recorded"}
+    head = "Last command" if manifest.get("last") else "Command"
+    facts = {head: manifest.get("line") or "not recorded"}
     for key, label in (("versions", "Versions"), ("machines", "Machine")):
         for entry in manifest.get(key, []):
             shown = (

@@ -155,7 +155,8 @@ class Results:
         runs: finished runs, in a fixed order.
         maps: policies that are drawn.
         anomalies: runs that are missing or differ.
-        manifest: `line`, `planned`, `wall_seconds`, `cpu_seconds`, `versions`, `machines`.
+        manifest: `line`, `last`, whether there were other lines before it, `planned`, the number of runs of all lines,
+            `wall_seconds`, `cpu_seconds`, `versions`, `machines`.
     """
 
     runs: Sequence[FinishedRun]
