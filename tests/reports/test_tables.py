@@ -86,6 +86,8 @@ def test_latex_letters_are_letters() -> None:
     assert lines[5] == (
         r"\textbackslash{} \{ \} \$ \textasciitilde{} \textasciicircum{} \& \% \# \_ \\"
     )
+    names = Table("t", "", [Column("x")], [["a <= b | c"], ["[red]"], ["*"]]).latex().splitlines()
+    assert names[5:8] == [r"a $<$= b $|$ c \\", r"{[}red] \\", r"{*} \\"]
 
 
 def test_a_cell_of_a_spreadsheet_is_no_formula() -> None:

@@ -20,6 +20,10 @@ _LATEX = {letter: f"\\{letter}" for letter in "{}$&%#_"} | {
     "~": r"\textasciitilde{}",
 }
 _LATEX |= {"^": r"\textasciicircum{}", "≤": r"$\le$", "±": r"$\pm$", "–": "--", "²": "$^2$"}
+# In LaTeX's default encoding these letters are others, < is an exclamation mark on its head.
+_LATEX |= {letter: f"${letter}$" for letter in "<>|"}
+# At the beginning of a row they would belong to the line break above.
+_LATEX |= {letter: f"{{{letter}}}" for letter in "[*"}
 
 
 @cache
