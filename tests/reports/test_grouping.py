@@ -120,6 +120,14 @@ def test_regret_is_to_the_best_upper_bound_that_any_run_of_the_world_has_proved(
     assert f"not certified: {world} by 0.0015" in outcome_table(found, None).caption
 
 
+def test_methods_that_ran_in_other_worlds_are_named_beside_their_means() -> None:
+    pairs = (("a2c", 0.1), ("a2c", 0.2), ("ppo", 0.2))
+    figures = {"aihtr": 1.0, **EARNED}
+    runs = [run(f"{a}{c}", f"algo={a}", options={"cost.sensor": c}, **figures) for a, c in pairs]
+    assert "not in all worlds: ppo 1 of 2" in outcome_table(study(runs), None).caption
+    assert "not in all worlds" not in outcome_table(study(runs[:2]), None).caption
+
+
 def test_a_learned_policy_above_that_of_the_solver_is_the_best_known() -> None:
     found = study([run("a", aihtr=99.4, optimal_lower=99.0, optimal_upper=100.0, **EARNED)])
     assert found.best(found.worlds[0]) == 99.4

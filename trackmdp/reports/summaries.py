@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from statistics import fmean
 
@@ -63,10 +64,15 @@ def outcome_table(study: Study, threshold: float | None) -> Table:
 
 
 def _note(study: Study) -> str:
-    """Worlds with an optimum that is not certified to four digits of the regret, and the tracks of each figure."""
+    """Methods without runs in some worlds, worlds whose optimum is not certified to four digits, and tracks."""
     wide = {world: width for world in study.worlds if (width := study.bracket(world)) >= OPEN}
     listed = ", ".join(f"{world} by {width:.4f}" for world, width in wide.items())
-    note = (
+    ran, count = Counter(method for _, method in study.groups), len(study.worlds)
+    fewer = ", ".join(
+        f"{each} {ran[each]} of {count}" for each in study.methods if ran[each] < count
+    )
+    note = f"; not in all worlds: {fewer}" if fewer else ""
+    note += (
         f"; regrets may be too large where the optimum is not certified: {listed}" if wide else ""
     )
     if study.several:
