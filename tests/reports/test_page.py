@@ -253,6 +253,19 @@ def test_the_page_in_a_browser(report: Report, browser: Browser, tmp_path: Path)
     assert browser.problems == []
 
 
+def test_without_a_solver_a_bound_counts_as_attained_only_where_a_learned_policy_attains_it(
+    results: Results, openings: Openings
+) -> None:
+    unsolved = {"optimal_lower": None, "optimal_upper": None}
+    runs = [replace(run, figures={**run.figures, **unsolved}) for run in results.runs]
+    text = sections(study(runs), openings)[-1].html()
+    assert (
+        "is attained by a policy in 0 of 3 pairs, by none that is known in Z = 3, c = 0.22" in text
+    )
+    best = study(runs).best(study(runs).worlds[0])
+    assert f'data-v="{best!r}"' in text
+
+
 def test_runs_of_an_earlier_line_count_as_planned_but_copies_do_not(tmp_path: Path) -> None:
     sweep = write_sweep(tmp_path / "sweep")
     shutil.copytree(sweep / "a2c-0.22-0", sweep / "z")
