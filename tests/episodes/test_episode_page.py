@@ -76,7 +76,8 @@ def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path: Path) -> None:
 
 
 def test_what_a_log_says_cannot_break_out_of_the_page(reader: EpisodeReader) -> None:
-    text = page(WORLD, reader.read(0), label="</script><b>&", seed="</script>")
+    text = page(WORLD, reader.read(0), label="</script><b>&@DATA@", seed="</script>")
+    assert "&amp;&#64;DATA&#64;</title>" in text
     assert text.count("</script>") == 2
     assert "&lt;/script&gt;&lt;b&gt;&amp;" in text
 

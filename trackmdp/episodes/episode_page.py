@@ -39,6 +39,7 @@ def page(problem: Problem | Group, episode: Recording, label: str = "", seed: st
     content = _content(problem, episode) | {"about": _about(problem, episode, seed)}
     text = json.dumps(content, separators=(",", ":"), allow_nan=False)
     title = html.escape(f"Episode {episode.number}" + (f": {label}" if label else ""))
+    title = title.replace("@", "&#64;")  # a label may hold a mark of the template
     # `<` inside the JSON could close its element
     return template.replace("@TITLE@", title).replace("@DATA@", text.replace("<", "\\u003c"))
 
