@@ -12,6 +12,7 @@ import pytest
 
 from trackmdp.app.cli import main
 from trackmdp.imports import importing
+from trackmdp.signals import handled
 
 
 @pytest.fixture(autouse=True)
@@ -42,6 +43,19 @@ def test_a_failed_import_leaves_the_collector_as_it_was() -> None:
     with importing():
         pass
     assert not gc.isenabled()
+
+
+def test_ctrl_c_inside_counts_at_the_end_and_a_second_one_at_once() -> None:
+    passed = []
+    with handled(signal.default_int_handler, signal.SIGINT):
+        with pytest.raises(KeyboardInterrupt), importing():
+            signal.raise_signal(signal.SIGINT)
+            passed.append("first")
+        with pytest.raises(KeyboardInterrupt), importing():
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+            passed.append("second")
+    assert passed == ["first"]
 
 
 INTERRUPTED = """

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from trackmdp.signals import Signals
 
 
 @contextmanager
@@ -16,11 +19,17 @@ def importing() -> Iterator[None]:
 
     torch and TorchRL make more than half a million objects that stay; the collector would look through them time and
     again, for a sixth of the time that a command takes to start.
+
+    A signal counts at the end, a second Ctrl-C at once: in a callback of Python's import locks it would be printed as
+    a traceback, and lost.
     """
     enabled = gc.isenabled()
     gc.disable()
     try:
-        yield
+        with Signals() as signals:
+            yield
+        if signals.received:
+            signal.raise_signal(signals.received)
     finally:
         gc.freeze()
         if enabled:
