@@ -377,6 +377,17 @@ sys.exit(main(["train"]))
     assert not list(empty_folder.iterdir())
 
 
+@pytest.mark.parametrize("words", [["--version"], ["solve", "grid.size=2"]])
+def test_closed_streams_are_no_mistake(words: list[str]) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "trackmdp", *words],
+        env=ENVIRONMENT,
+        preexec_fn=lambda: (os.close(1), os.close(2)),
+        check=False,
+    )
+    assert done.returncode == (2 if "solve" in words else 0)
+
+
 class Interrupted:
     def __set_name__(self, *_: object) -> None:
         raise KeyboardInterrupt

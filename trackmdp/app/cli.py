@@ -33,6 +33,11 @@ COMMANDS = {
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit status: 0, or one of `trackmdp.errors`, or 128 + the signal that ended it."""
     words = sys.argv[1:] if argv is None else argv
+    # `>&-`: what is printed is dropped, and no file of a run becomes descriptor 1 or 2, where libraries print.
+    sys.stdout, sys.stderr = (
+        stream or os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
+        for stream in (sys.stdout, sys.stderr)
+    )
     # Set before TorchRL and NumPy are imported, which read them then.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reports every buffer it makes
     # Shared out to more threads, by default to all cores, sums round differently: the last digits of exact figures
