@@ -26,6 +26,7 @@ RENAMED: dict[str, str] = {
     "algo.lr": "algo.learning_rate",
     "algo=learned_kernel": "algo=model_based",
     "algo=path_counts": "algo=model_based",
+    "credit": "algo=a2c_per_sensor",
     "kernel.cell": "grid.cell",
     "kernel.crs": "grid.crs",
     "kernel.homogeneous": "algo.share_cells",
