@@ -130,6 +130,16 @@ def test_every_figure_has_a_name_its_numbers_and_its_n(report: Report) -> None:
         assert figure.table.rows
 
 
+def test_no_two_columns_of_a_table_have_one_heading_and_prices_have_all_digits(
+    report: Report,
+) -> None:
+    for table in (*report.tables, *(figure.table for figure in report.figures)):
+        heads = [column.heading for column in table.columns]
+        assert len({*heads}) == len(heads), table.name
+        prices = [column for column in table.columns if column.label.startswith("c, price")]
+        assert all(column.text(0.125) == "0.125" for column in prices)
+
+
 def test_the_words_of_the_page_are_explained_on_it(report: Report) -> None:
     words = re.search(r'<section id="words">.*?</section>', report.html(), re.DOTALL)
     assert words

@@ -105,7 +105,7 @@ def sensitivity_table(settings: Sequence[Setting]) -> Table:
     """Median and range over draws of three figures, for every setting and pair."""
     columns = [Column("border"), Column("T_max"), Column("Z"), Column("c", 2)]
     for label, digits in (("Q_MDP accuracy %", 2), ("Q_MDP AIHTR", 1), ("clocked bound AIHTR", 1)):
-        columns += _spread_columns(f"{label}, median", digits)
+        columns += _spread_columns(digits, f"{label}, ")
     rows = [
         [*at, *accuracy, *simple, *clocked]
         for *at, accuracy, simple, clocked, _ in map(astuple, settings)
@@ -114,9 +114,9 @@ def sensitivity_table(settings: Sequence[Setting]) -> Table:
     return Table("sensitivity", caption, columns, rows)
 
 
-def _spread_columns(head: str, digits: int) -> list[Column]:
+def _spread_columns(digits: int, head: str = "") -> list[Column]:
     """Columns of a `Spread`."""
-    return [Column(label, digits) for label in (head, "low", "high")]
+    return [Column(f"{head}{part}", digits) for part in ("median", "low", "high")]
 
 
 def sensitivity_figures(settings: Sequence[Setting]) -> list[Figure]:
@@ -164,7 +164,7 @@ def _ranges(
     under = f"under the paper's unstated settings, c = {settings[0].cost:g}"
     dotted = "; dotted: the printed values" if printed else ""
     title = f"{label} {under}: median and range, n = {len(DRAWS)} draws{dotted}"
-    columns = [*map(Column, ("border", "T_max", "Z")), *_spread_columns("median", 2)]
+    columns = [*map(Column, ("border", "T_max", "Z")), *_spread_columns(2)]
     numbers: Rows = [[s.border, s.t_max, s.support_size, *astuple(of(s))] for s in settings]
     table = Table(f"sensitivity-{name}", title, columns, numbers)
     return draw_figure(table, 4.2, paint)
@@ -214,7 +214,7 @@ def accuracy_table(study: Study, chosen: Pairs) -> Table:
     ]
     columns.append(Column("TMDP, printed", 2, "%"))
     for method in study.methods:
-        columns += [Column(method, 2, "%"), Column("n")]
+        columns += [Column(method, 2, "%"), Column(f"n, {method}")]
     return Table(
         "accuracy", "Table II: tracking accuracy, printed and exact; n seeds each", columns, rows
     )

@@ -183,7 +183,7 @@ def against_price(study: Study, panel: Panel, key: str, threshold: float | None)
         f"{key.replace('_', '-')}-{slug(title)}",
         f"{column.label[0].upper()}{column.label[1:]} by the price of a sensor, {title}; {_count(learned)} seeds",
         [*learned, *others],
-        (Column("c, price of a sensor for one step", 2), column),
+        (Column("c, price of a sensor for one step"), column),
         finish,
         floor=FLOOR if key == "regret" else -math.inf,
         shift=0.03 * float(np.diff(costs).min()) / len(learned),

@@ -74,7 +74,7 @@ class Column:
 
 def interval_columns(digits: int | None, head: str = "") -> list[Column]:
     """Columns for the ends of an interval."""
-    return [Column(f"{head}95 % from", digits), Column("to", digits)]
+    return [Column(f"{head}95 % from", digits), Column(f"{head}to", digits)]
 
 
 @dataclass(frozen=True)

@@ -119,7 +119,7 @@ def swept_figure(study: Study, panel: Panel) -> Figure | None:
     caption = (
         f"Accuracy against sensors per step at all prices, {title}{line}; n = {max(counts)} seeds"
     )
-    columns = [Column("policy"), Column("c", 2), Column("sensors per step", 3)]
+    columns = [Column("policy"), Column("c"), Column("sensors per step", 3)]
     columns += [Column("accuracy", 4), Column("on the line"), Column("n")]
     table = Table(f"frontier-{slug(title)}", caption, columns, rows)
     return draw_figure(table, 3.4, paint) if max(counts) else None
