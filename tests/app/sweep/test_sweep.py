@@ -296,3 +296,10 @@ def test_runs_on_recordings_are_compared_by_the_validation_tracks(tmp_path: Path
     show_runs(Console(file=out, width=120), [run], [], tmp_path)
     assert "validation AIHTR" in out.getvalue()
     assert "9.000" in out.getvalue() and "8.000" not in out.getvalue()
+
+
+def test_a_run_without_words_of_its_own_is_shown_by_its_digest(tmp_path: Path) -> None:
+    out = io.StringIO()
+    runs = [RunState(tmp_path / name, (), "done") for name in ("161d8da3", "seed_1-0a1b2c3d")]
+    show_runs(Console(file=out, width=120), runs, [], tmp_path)
+    assert "161d8da3" in out.getvalue() and "seed_1" in out.getvalue()

@@ -164,9 +164,9 @@ def show_runs(
     console: Console, runs: Sequence[RunState], skipped: Collection[Path], sweep: Path
 ) -> None:
     """Every run with its state, AIHTR and regret per step, or why it failed."""
-    # Without the digest, where the readable part is different for each run.
+    # Without the digest, where the readable part is different for each run; one without words of its own has none.
     names = [run.folder.name.rpartition("-")[0] for run in runs]
-    if len(set(names)) < len(names):
+    if len({"", *names}) <= len(names):
         names = [run.folder.name for run in runs]
     states = [
         "skipped" if run.folder in skipped and run.state == "done" else run.state for run in runs
