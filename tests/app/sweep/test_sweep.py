@@ -303,3 +303,15 @@ def test_a_run_without_words_of_its_own_is_shown_by_its_digest(tmp_path: Path) -
     runs = [RunState(tmp_path / name, (), "done") for name in ("161d8da3", "seed_1-0a1b2c3d")]
     show_runs(Console(file=out, width=120), runs, [], tmp_path)
     assert "161d8da3" in out.getvalue() and "seed_1" in out.getvalue()
+
+
+def test_runs_of_several_targets_are_compared_by_all_of_them_together(tmp_path: Path) -> None:
+    figures = {"aihtr": {"mean": 19.0}, "accuracy": {"mean": 0.9}, "sensors_per_step": {"mean": 2}}
+    several = {"figures": figures, "upper": 20.0, "expected_length": 10.0}
+    single = {"policy": {"aihtr": 11.0, "accuracy": 0.8}, "regret_per_step": 0.0, "frames": 10}
+    write_table(
+        tmp_path, [RunState(tmp_path / "a-0", (), "done", result=single | {"several": several})]
+    )
+    (row,) = table(tmp_path)
+    found = (row["aihtr"], row["regret_per_step"], row["accuracy"], row["sensors_per_step"])
+    assert found == ("19.0", "0.1", "0.9", "2")

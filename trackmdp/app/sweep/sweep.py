@@ -239,6 +239,7 @@ def run_figures(run: RunState) -> dict[str, Any]:
     """The figures by which runs are compared; of another command than `train` the one value that it returns.
 
     On recordings they are those on the validation tracks: a choice by the held-out tracks would be the luckiest there.
+    Of several targets they are of all together, also where the plan of a single one is merged.
     """
     if "policy" not in run.result:
         return {"aihtr": run.result.get("value")}
@@ -246,6 +247,10 @@ def run_figures(run: RunState) -> dict[str, Any]:
     found = {name: run.result.get(name) for name in ("regret_per_step", "frames")}
     if validation:
         found |= {name: policy.get(name.removeprefix("held_out_")) for name in _HELD_OUT}
+    several = run.result.get("several") or {}
+    if (upper := several.get("upper")) is not None:
+        policy = {name: each["mean"] for name, each in several["figures"].items()}
+        found["regret_per_step"] = (upper - policy["aihtr"]) / several["expected_length"]
     return {**(validation or policy), **found}
 
 
