@@ -445,7 +445,16 @@ def test_ctrl_c_in_the_search_for_a_baseline_writes_nothing(
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="has no /dev/full")
-@pytest.mark.parametrize("words", ["solve grid.size=4", "train --help", "train --help all"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        "solve grid.size=4",
+        "train --help",
+        "train --help all",
+        "train --info all",
+        "train --cfg all",
+    ],
+)
 def test_a_full_disk_under_standard_output_is_one_line(words: str, empty_folder: Path) -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(

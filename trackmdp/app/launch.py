@@ -6,10 +6,12 @@ Hydra's own flags ask about the config instead: --cfg, --info, --hydra-help, --s
 from __future__ import annotations
 
 import argparse
+import io
 import shlex
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -242,20 +244,23 @@ def answer(compose: Composer, args: argparse.Namespace) -> bool:
         _register_name(compose.command, run_words(compose.words), sweeper)
         if args.package not in (None, "_global_") and OmegaConf.select(cfg, args.package) is None:
             raise UserError(f"--package {args.package}: not in the config")
-    try:
-        if args.cfg:
-            hydra.show_cfg(compose.name, compose.words, args.cfg, args.package, args.resolve)
-        elif args.info:
-            hydra.show_info(args.info, compose.name, compose.words)
-        elif args.hydra_help:
-            args.overrides = []  # Hydra's help is about no command
-            hydra.hydra_help(None, _parser(), args)
-        elif compose.words == ["install=bash"]:
-            sys.stdout.write(bash([*ROOTS, "example"]))
-        else:
-            hydra.shell_completion(compose.name, compose.words)
-    except Exception as error:  # of many kinds; all are about the command line
-        raise UserError(message_of(error)) from error
+    # Hydra logs its answers, and `logging` shows a traceback for each line that nobody reads: `--info defaults | head`.
+    with redirect_stdout(io.StringIO()) as answered:
+        try:
+            if args.cfg:
+                hydra.show_cfg(compose.name, compose.words, args.cfg, args.package, args.resolve)
+            elif args.info:
+                hydra.show_info(args.info, compose.name, compose.words)
+            elif args.hydra_help:
+                args.overrides = []  # Hydra's help is about no command
+                hydra.hydra_help(None, _parser(), args)
+            elif compose.words == ["install=bash"]:
+                sys.stdout.write(bash([*ROOTS, "example"]))
+            else:
+                hydra.shell_completion(compose.name, compose.words)
+        except Exception as error:  # of many kinds; all are about the command line
+            raise UserError(message_of(error)) from error
+    sys.stdout.write(answered.getvalue())
     return True
 
 
