@@ -8,6 +8,7 @@ import re
 import tokenize
 from collections import Counter
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -30,6 +31,11 @@ def prose(source: str) -> Iterator[str]:
             yield token.string.lstrip("# ")
 
 
+@cache
+def of_package() -> Counter[str]:
+    return words(file.read_text(encoding="utf-8") for file in PACKAGE.rglob("*.py"))
+
+
 def words(sources: Iterator[str]) -> Counter[str]:
     """How often each word occurs in the prose of some modules."""
     texts = (text for source in sources for text in prose(source))
@@ -43,8 +49,7 @@ def rate(found: Counter[str], chosen: tuple[str, ...]) -> float:
 
 @pytest.mark.parametrize("chosen", LIMITS, ids=lambda chosen: chosen[0])
 def test_the_package_names_things(chosen: tuple[str, ...]) -> None:
-    found = words(file.read_text(encoding="utf-8") for file in PACKAGE.rglob("*.py"))
-    assert rate(found, chosen) <= LIMITS[chosen]
+    assert rate(of_package(), chosen) <= LIMITS[chosen]
 
 
 def test_docstrings_and_comments_are_counted_and_code_is_not() -> None:

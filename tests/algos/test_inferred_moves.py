@@ -38,17 +38,17 @@ def test_hidden_states_are_those_that_explain_what_was_sensed() -> None:
 
 
 def test_moves_are_inferred_alike_in_whatever_pieces_and_whenever_asked_for() -> None:
-    batch = collect(ROAM, Policy.all_on(ROAM), 64, 40)
+    batch = collect(ROAM, Policy.all_on(ROAM), 32, 20)
     whole, pieces = (InferredMoves(ROAM.task, torch.Generator().manual_seed(0)) for _ in range(2))
     whole.extend(batch)
-    for part in batch.split(32):
+    for part in batch.split(16):
         pieces.extend(part)
         pieces.moves()
     resumed = InferredMoves(ROAM.task, torch.Generator().manual_seed(0))
     resumed.load_state_dict(pieces.state_dict())
-    expected = whole.paths(200_000, 3)
-    assert torch.equal(pieces.paths(200_000, 3), expected)
-    assert torch.equal(resumed.paths(200_000, 3), expected)
+    expected = whole.paths(20_000, 3)
+    assert torch.equal(pieces.paths(20_000, 3), expected)
+    assert torch.equal(resumed.paths(20_000, 3), expected)
     assert len(resumed) == len(whole) > 100
 
 

@@ -78,7 +78,7 @@ def test_paths_are_read_from_observations() -> None:
 def test_it_finds_the_optimum_of_a_small_world(sensing: str) -> None:
     world = small_world(3)
     warm_up = ["algo.warm_up=5000"] if sensing == "chosen" else []
-    learner, _ = learn(world, 12, f"algo.sensing={sensing}", *warm_up)
+    learner, _ = learn(world, 8, f"algo.sensing={sensing}", *warm_up)
     best = optimal.solve(world)
     assert evaluate(world, learner.actor).aihtr == pytest.approx(best.lower, abs=0.01)
 
@@ -96,7 +96,7 @@ def test_it_finds_the_optimum_of_a_small_world(sensing: str) -> None:
 )
 def test_it_comes_near_the_optimum_with_every_kind_of_sensing(more: dict[str, object]) -> None:
     world = small_world(3, exit_probability=0.05).but(**{"safe_cost": 0.9} | more)
-    learner, _ = learn(world, 6)
+    learner, _ = learn(world, 4)
     known = optimal.solve(world.but(max_steps=None, memory="cell")).table
     best, found = (evaluate(world.but(memory="cell"), known), evaluate(world, learner.actor))
     assert regret_per_step(best.aihtr, found) < 0.02
@@ -115,8 +115,8 @@ def test_a_hidden_mode_is_learned_by_paths(detection: float) -> None:
 
 def test_chosen_sets_cost_less() -> None:
     world = small_world(3)
-    _, fully = learn(world, 6)
-    learner, chosen = learn(world, 6, "algo.sensing=chosen", "algo.warm_up=5000")
+    _, fully = learn(world, 3)
+    learner, chosen = learn(world, 3, "algo.sensing=chosen", "algo.warm_up=5000")
     assert fully[-1]["sensors_per_frame"] == chosen[0]["sensors_per_frame"] == pytest.approx(9.0)
     assert chosen[-1]["sensors_per_frame"] < 5.0
     assert not (learner.policy.bits == 255).all()
@@ -127,12 +127,12 @@ def test_it_keeps_to_a_budget_also_while_learning(budget: int) -> None:
     """No sensor is on in the first batch: the moves are inferred from where the safe action located the target."""
     world, most = small_world(3).but(budget=budget), []
     learner = algorithm("model_based", world, f"cost.budget={budget}")
-    learner.iterations = 10
-    for seed in range(10):
-        batch = collect(world, learner.policy, 512, 20, seed=seed)
+    learner.iterations = 6
+    for seed in range(6):
+        batch = collect(world, learner.policy, 256, 20, seed=seed)
         most.append(int(batch["action"].sum(-1).max()))
         learner.step(batch)
-    assert most == [0] + [budget] * 9
+    assert most == [0] + [budget] * 5
     best, found = optimal.solve(world), evaluate(world, learner.actor)
     assert regret_per_step(best.lower, found) < 0.01
 
@@ -174,8 +174,11 @@ def test_its_uncertainty_shrinks_and_covers_the_truth() -> None:
 @pytest.mark.usefixtures("little_search")
 @pytest.mark.parametrize("sensing", ["all", "chosen"])
 @pytest.mark.parametrize("hidden", [False, True])
-def test_a_resumed_learner_goes_on_as_the_first(sensing: str, hidden: bool, tmp_path: Path) -> None:
+def test_a_resumed_learner_goes_on_as_the_first(
+    sensing: str, hidden: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """From a file of plain tensors and words."""
+    monkeypatch.setattr("trackmdp.algos.observed.EM_ROUNDS", 10)
     world = headings(memory="displacement").but(detection=0.9) if hidden else small_world(3)
     words = (f"algo.sensing={sensing}", *(["algo.warm_up=0"] if sensing == "chosen" else []))
     first = algorithm("model_based", world, *words)

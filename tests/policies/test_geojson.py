@@ -67,6 +67,7 @@ def test_a_cell_without_a_value_has_null(world: tm.World) -> None:
     assert all(each["properties"]["on_0"] == [] for each in features)
 
 
+@pytest.mark.usefixtures("little_search")
 def test_a_memory_is_shown_as_at_the_start() -> None:
     world = tm.make_world("heading", size=3, memory="displacement", t_max=0, **ON_A_MAP)
     policy = tm.solve(world).policy

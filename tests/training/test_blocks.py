@@ -66,7 +66,10 @@ def test_blocks_without_a_sensor_have_nothing_to_learn(tmp_path: Path) -> None:
     cost = np.full((8, 8), np.nan)
     cost[:, 6:] = 0.16
     run = tm.train(
-        world(cost=cost), "model_based", folder=tmp_path, **SMALL | {"collector.total_frames": 600}
+        world(cost=cost),
+        "model_based",
+        folder=tmp_path,
+        **SMALL | {"collector.total_frames": 600, "algo.rounds": 1},
     )
     assert run.evaluation.aihtr == pytest.approx(evaluate(world(cost=cost), run.policy).aihtr)
     assert len(list((tmp_path / "blocks").iterdir())) == 2  # of four

@@ -133,6 +133,7 @@ def test_q_mdp_of_the_estimated_kernel_is_that_of_the_kernel() -> None:
 
 FILE = drawn(small_world(exit_probability=0.05).kernel, 60)
 WORDS = ("kernel=tracks", "kernel.min_length=1")
+FEW = "collector.total_frames=1024"
 
 
 @pytest.fixture
@@ -154,9 +155,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     def trained(algo: str) -> Path:
         folder = tmp_path_factory.mktemp(algo)
         whole = write(folder / "tracks.csv", FILE)
-        run(folder / "clean", whole, algo=algo)
+        run(folder / "clean", whole, FEW, algo=algo)
         for name, part in zip(PARTS, parts(whole), strict=True):
-            run(folder / name, poisoned(folder / f"{name}.csv", part), algo=algo)
+            run(folder / name, poisoned(folder / f"{name}.csv", part), FEW, algo=algo)
         return folder
 
     return trained

@@ -39,9 +39,17 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_a_report_holds_page_figures_tables_and_what_it_was_made_from(
-    sweep: Path, capsys: pytest.CaptureFixture[str]
+    sweep: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    whole, held = report.save_results, list[bool]()
+
+    def saved(found: Results, folder: Path) -> None:
+        held.append(is_locked(folder))
+        whole(found, folder)
+
+    monkeypatch.setattr(report, "save_results", saved)
     assert main(["report", f"sweep={sweep}"]) == 0
+    assert held == [True]  # one report at a time is written to a folder
     assert capsys.readouterr().out == f"12 runs; report in {sweep / 'report/report.html'}\n"
     made = contents(sweep / "report")
     tables = {f"tables/outcome.{ending}" for ending in ("csv", "tex")} | {"tables/runs.csv"}
@@ -57,27 +65,11 @@ def test_a_report_holds_page_figures_tables_and_what_it_was_made_from(
     assert contents(Path("two")) == made
     assert len(run_folders(sweep, None)) == 12  # the report that lies there is no run
 
-
-def test_sweeps_are_reported_one_by_one(sweep: Path) -> None:
+    # sweeps are reported one by one
     line = ["report", "-m", f"sweep={sweep},{sweep}/report", "quiet=true", "hydra.sweep.dir=all"]
-    assert main(["report", f"sweep={sweep}", "quiet=true"]) == 0
     assert main(line) == 0
-    first, second = (page.read_bytes() for page in Path("all").glob("*/report.html"))
-    assert first == second == (sweep / "report/report.html").read_bytes()
-
-
-def test_one_report_at_a_time_is_written_to_a_folder(
-    sweep: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole, held = report.save_results, list[bool]()
-
-    def saved(found: Results, folder: Path) -> None:
-        held.append(is_locked(folder))
-        whole(found, folder)
-
-    monkeypatch.setattr(report, "save_results", saved)
-    assert main(["report", f"sweep={sweep}", "hydra.run.dir=one", "quiet=true"]) == 0
-    assert held == [True]
+    pages = [page.read_bytes() for page in Path("all").glob("*/report.html")]
+    assert pages == [made["report.html"]] * 2
 
 
 def test_a_missing_run_is_named_in_one_line_and_in_the_page(

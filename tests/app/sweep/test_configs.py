@@ -43,13 +43,13 @@ def composer() -> Iterator[Composer]:
 @pytest.mark.parametrize(
     ("words", "calls"),
     [
-        ("seed=range(6)", 1),
-        ("seed=0,1,2 cost.sensor=0.1,1,0.3", 1),
-        ("algo=ppo,a2c seed=0,1,2 algo.gamma=0.9,0.95", 2),
-        ("log=[csv] log.csv.every=1,2,3", 1),
-        ("optimal.enabled=true,false seed=0,1,2", 1),
-        ("algo.total_frames=20000,40000,60000", 1),  # those of the collector follow
-        ("kernel.support_size=3,4,5", 1),  # the kernel's seed follows
+        ("seed=range(3)", 1),
+        ("seed=0,1 cost.sensor=0.1,1,0.3", 1),
+        ("algo=ppo,a2c seed=0,1 algo.gamma=0.9,0.95", 2),
+        ("log=[csv] log.csv.every=1,2", 1),
+        ("optimal.enabled=true,false seed=0,1", 1),
+        ("algo.total_frames=20000,40000", 1),  # those of the collector follow
+        ("kernel.support_size=3,4", 1),  # the kernel's seed follows
         ("grid.size=3,4,[3,4]", 2),
         ("cost.safe=3,null,4.5", 2),
         ("kernel=drift,random_walk seed=0,1", 2),
