@@ -55,6 +55,7 @@ MISTAKES = [
     ("part=env kernel=drfit", "kernel=drfit"),
     ("part=env threads=0", "threads=0"),
     ("part=peers peers=nowhere", "peers=nowhere"),
+    ("part=env out=no/such/o", "out"),
 ]
 
 

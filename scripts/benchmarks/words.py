@@ -8,11 +8,10 @@ import json
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import trackmdp as tm
-from trackmdp.errors import UserError
+from trackmdp.errors import UserError, output_of
 from trackmdp.training.devices import machine
 
 Row = dict[str, Any]
@@ -81,14 +80,14 @@ def measure(given: Mapping[str, str]) -> list[Row]:
             raise UserError(f"{key}: unknown with part={part}, expected one of {', '.join(known)}")
     options = known | {key: value_of(key, text, known[key]) for key, text in own.items()}
     _set_threads(options["threads"])
-    out = options["out"]
+    out = options["out"] and output_of(options["out"], "out")
     found: list[Row] = []
     for row in rows(world, **{key: options[key] for key in defaults(rows)}):
         found.append(row)
         if out:
             # After every row: an interrupted benchmark keeps the rows measured so far.
             content = {"part": part, "machine": machine(), "rows": found}
-            Path(out).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+            out.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     return found
 
 
