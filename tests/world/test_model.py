@@ -12,6 +12,7 @@ import pytest
 from tests.helpers import hop_world
 from trackmdp.errors import UserError
 from trackmdp.sensing.task import Task
+from trackmdp.world.group import Group
 from trackmdp.world.make import load_tracks, make_world
 from trackmdp.world.model import World
 
@@ -81,3 +82,11 @@ def test_a_grid_that_cannot_fit_into_memory_is_refused_before_any_is_asked_for(
     with pytest.raises(UserError, match=r"size=\[?\d.*: needs about .* GiB") as said:
         made()
     assert "\n" not in str(said.value)
+
+
+def test_expected_steps_of_a_group_are_those_of_the_longest_of_geometric_episodes() -> None:
+    stay = 0.995
+    group = Group([World(np.full((2, 2), stay / 2), (1, 2), cost=0.1)] * 3)
+    longest = 3 / (1 - stay) - 3 / (1 - stay**2) + 1 / (1 - stay**3)
+    assert group.expected_steps == pytest.approx(longest, rel=1e-11)
+    assert group.target_steps == pytest.approx(3 * stay / (1 - stay), rel=1e-11)

@@ -136,12 +136,14 @@ class Group(Carded):
     @cached_property
     def _steps(self) -> tuple[float, float]:
         inside = [np.full(world.num_cells, 1.0 / world.num_cells) for world in self.kinds]
+        arrivals = [world.kernel.T.tocsr() for world in self.kinds]
         total, each, left, taken = 0.0, 0.0, 1.0, 0
-        while left > 1e-12 * max(total, 1.0) and taken != self.task.max_steps:
+        # What is still to come is about `left` times the total.
+        while left > 1e-13 and taken != self.task.max_steps:
             taken += 1
             # The step taken counts where any target was in the grid before it.
             total += left
-            inside = [mass @ world.kernel for mass, world in zip(inside, self.kinds, strict=True)]
+            inside = [moves @ mass for moves, mass in zip(arrivals, inside, strict=True)]
             there = np.array([mass.sum() for mass in inside])[self.kind]
             each += float(there.sum())
             # 1 - Π (1 - p) in logarithms: with p near 0 the product alone would lose all digits.
