@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,19 +13,19 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import ProbabilisticActor
 
-from tests.helpers import ALGORITHMS, algorithm, random_kernel, random_state, small_world
+from tests.helpers import ALGORITHMS, algorithm, random_state, small_world
 from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
 from trackmdp.policies import lookup, policy
 from trackmdp.policies.forms import STATE_KEYS
 from trackmdp.policies.nets import SubsetDistribution
 from trackmdp.policies.policy import Policy, as_policy
-from trackmdp.sensing.task import Task
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.group_run import learned_policy
-from trackmdp.world.model import World
 
 WORLD = small_world(t_max=2)
+
+
 M, CHOICES = WORLD.num_cells, WORLD.num_choices
 
 
@@ -266,106 +265,6 @@ def test_a_recurrent_module_keeps_its_state_in_every_episode() -> None:
             assert on.tolist() == [9 if t % 3 == 0 else 0 for t in range(len(on))]
 
 
-def test_in_a_window_a_mixture_is_over_its_sensors() -> None:
-    world = windowed()
-    made = as_policy(world, stochastic(reads_history=False, width=9))
-    # Around cell 0 the local sensors 4, 5, 7 and 8 are the cells 0, 1, 4 and 5; the others lie outside the grid.
-    expected = torch.zeros(12)
-    expected[[0, 1, 4, 5]] = torch.sigmoid((1 + torch.tensor([4.0, 5, 7, 8])) / 4 - 2)
-    assert torch.allclose(made.probabilities(torch.tensor([0]), torch.tensor([1]))[0], expected)
-
-
-class Signs(torch.distributions.HalfNormal):
-    """Draws subsets, and does not say how likely each is."""
-
-    has_rsample = False
-
-    def sample(self, sample_shape: Any = ()) -> torch.Tensor:
-        return super().sample(sample_shape) > 1
-
-
-SHARED = torch.Generator().manual_seed(0)
-DRAWING: dict[str, Any] = {
-    "torch": lambda x, n, h: torch.rand(len(x), M) < 0.5,
-    "torch, seldom": lambda x, n, h: torch.rand(len(x), M) < 1e-9,
-    "its own generator": lambda x, n, h: torch.rand(len(x), M, generator=SHARED) < 0.5,
-    "numpy": lambda x, n, h: np.random.random((len(x), M)) < 0.5,  # noqa: NPY002
-    "module": TensorDictModule(
-        lambda x: torch.rand(*x.shape, M) < 0.5, in_keys=["last_cell"], out_keys=["action"]
-    ),
-    "an actor of another form": ProbabilisticActor(
-        TensorDictModule(
-            lambda x: torch.ones(len(x), M), in_keys=["last_cell"], out_keys=["scale"]
-        ),
-        in_keys=["scale"],
-        distribution_class=Signs,
-    ),
-    "dropout": TensorDictModule(
-        lambda x: torch.nn.functional.dropout(torch.ones(*x.shape, M)) > 0,
-        in_keys=["last_cell"],
-        out_keys=["action"],
-    ),
-}
-
-
-@pytest.mark.parametrize("name", DRAWING)
-def test_what_draws_is_refused_in_one_line(name: str) -> None:
-    with pytest.raises(UserError, match="draws at random") as refused:
-        as_policy(WORLD, DRAWING[name])
-    assert "\n" not in str(refused.value)
-
-
-def sequence(key: str) -> TensorDictModule:
-    return TensorDictModule(
-        lambda x: torch.ones(len(x), M, dtype=torch.bool), in_keys=[key], out_keys=["action"]
-    )
-
-
-WRONG: dict[str, tuple[Any, str]] = {
-    "numbers": (
-        lambda x, n, h: torch.full((len(x), M), 0.5),
-        "its action: expected 0 or 1 for each sensor, got 0.5",
-    ),
-    "another width": (
-        lambda x, n, h: torch.zeros(len(x), M + 1, dtype=torch.bool),
-        r"bool \[9, 10\]",
-    ),
-    "reads more": (sequence("hidden"), "reads hidden"),
-    "reads the target": (sequence("target"), "reads target"),
-    "no action": (
-        TensorDictModule(torch.nn.Identity(), in_keys=["last_cell"], out_keys=["a"]),
-        "writes no action",
-    ),
-    "a number": (3, "a int, expected a Policy"),
-    "another world": (
-        Policy.all_on(small_world(2, t_max=2)),
-        "made for 2 x 2 cells, t_max 2; expected 3 x 3",
-    ),
-    "as many cells": (Policy.all_on(Task((1, 9), cost=0.1, t_max=2)), "made for 1 x 9 cells"),
-}
-
-
-@pytest.mark.parametrize("name", WRONG)
-def test_what_is_no_policy_is_refused_in_one_line(name: str) -> None:
-    given, message = WRONG[name]
-    with pytest.raises(UserError, match=message):
-        as_policy(WORLD, given)
-
-
-@pytest.mark.parametrize(
-    "wrong", [np.zeros((M, CHOICES, M + 1)), np.full((M, CHOICES, M), 1.5), -table().astype(int)]
-)
-def test_a_table_that_is_none_is_refused(wrong: np.ndarray) -> None:
-    with pytest.raises(UserError, match="expected"):
-        Policy.from_dense(WORLD, wrong)
-
-
-def test_a_complex_table_is_refused() -> None:
-    for make in (lambda on: Policy.from_dense(WORLD, on), lambda on: evaluate(WORLD, on)):
-        with pytest.raises(UserError, match="complex128"):
-            make(table() * 1j)
-
-
 def test_a_sparse_table_is_brought_into_order_and_left_alone() -> None:
     on = table()
     ordered = sparse.csr_array(on.reshape(-1, M).astype(np.int8))
@@ -386,135 +285,3 @@ def test_an_actor_that_is_a_policy_is_not_written_out() -> None:
     actor = Policy.all_on(WORLD)
     assert learned_policy(WORLD, actor, torch.device("cpu")) is actor
     assert actor.sets is None
-
-
-def windowed() -> World:
-    return World(
-        random_kernel(np.random.default_rng(0), 12, 0.1), (3, 4), cost=0.2, t_max=2, window=1
-    )
-
-
-def test_all_on_is_all_of_the_window() -> None:
-    world = windowed()
-    made = Policy.all_on(world)
-    assert made.deterministic
-    assert made.as_lists()["sets"]["0"] == [[0, 1, 4, 5]] * 3
-    assert made.as_lists()["sets"]["6"] == [[1, 2, 3, 5, 6, 7, 9, 10, 11]] * 3
-    state = {"last_cell": torch.tensor([0, 6]), "steps_since_detection": torch.tensor([0, 3])}
-    action = made(TensorDict(state, [2]))["action"]
-    assert [on.nonzero().flatten().tolist() for on in action] == [[4, 5, 7, 8], list(range(9))]
-    assert made.spent(1, world.cost) == pytest.approx(0.2 * made.dense()[:, 1].sum(1))
-    assert not Policy.none(world)(TensorDict(state, [2]))["action"].any()
-
-
-@pytest.mark.parametrize("dense_up_to", [0, policy._DENSE])
-def test_in_a_window_policies_act_and_are_asked_in_its_numbers(
-    dense_up_to: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(policy, "_DENSE", dense_up_to)
-    monkeypatch.setattr("trackmdp.policies.unroll._HISTORY_AT_ONCE", 5 * 3 * 9)
-    world = windowed()
-    near = Policy.all_on(world).dense()
-    table = near & (np.random.default_rng(0).random(near.shape) < 0.5)
-    acting = Policy.from_dense(world, table)
-    asked = TensorDictModule(
-        lambda x, n, h: (
-            acting(TensorDict({"last_cell": x, "steps_since_detection": n}, [len(x)]))["action"]
-            | h.new_ones(len(x), 1) & (torch.arange(9) == 0)
-        ),
-        in_keys=["last_cell", "steps_since_detection", "action_history"],
-        out_keys=["action"],
-    )
-    read = as_policy(world, asked).dense()
-    upper_left = np.zeros_like(near)
-    for x in range(12):
-        if x >= 5 and x % 4:
-            upper_left[x, :, x - 5] = True
-    assert (read == table | upper_left).all()
-
-
-def test_random_k_of_a_window() -> None:
-    world = windowed()
-    drawing = Policy.random_k(world, 5)
-    assert drawing.chosen(0, np.array([0, 6, 0]), np.array([5, 1, 2])) == pytest.approx(
-        [1.0, 5 / 9, 0.0]
-    )
-    torch.manual_seed(0)
-    state = {
-        "last_cell": torch.tensor([0, 6]).repeat(500),
-        "steps_since_detection": torch.zeros(1000, dtype=torch.int64),
-    }
-    action = drawing(TensorDict(state, [1000]))["action"]
-    assert action.shape == (1000, 9)
-    assert action.sum(1).tolist() == [4, 5] * 500
-    assert action[1::2].double().mean(0) == pytest.approx(np.full(9, 5 / 9), abs=5 * 0.5 / 500**0.5)
-
-
-def test_random_k_of_the_sensors_that_exist() -> None:
-    cost = np.where(np.arange(M) < 4, 0.1, np.nan)
-    drawing = Policy.random_k(Task((3, 3), cost=cost, t_max=1), 3)
-    share = np.where(np.arange(M) < 4, 3 / 4, 0.0)
-    assert drawing.chosen(0, np.zeros(M, dtype=int), np.arange(M)) == pytest.approx(share)
-    state = {"last_cell": torch.zeros(50, dtype=torch.int64)}
-    state["steps_since_detection"] = state["last_cell"]
-    action = drawing(TensorDict(state, [50]))["action"]
-    assert action.sum(1).tolist() == [3] * 50
-    assert not action[:, 4:].any()
-
-
-@pytest.mark.parametrize("at_once", [1, 3, 4, 100])
-@pytest.mark.parametrize(("cell", "n", "sensor"), [(0, 2, 2), (3, 0, 5), (11, 2, 0)])
-def test_a_sensor_outside_the_window_is_refused(
-    cell: int, n: int, sensor: int, at_once: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Among sensors that can be chosen, wherever it is, and however many are checked at once."""
-    monkeypatch.setattr("trackmdp.policies.table._AT_ONCE", at_once)
-    on = np.zeros((12, 3, 12), dtype=bool)
-    on[::2, 1] = np.eye(12, dtype=bool)[::2]
-    Policy.from_dense(windowed(), on)
-    on[cell, n, sensor] = True
-    with pytest.raises(
-        UserError, match=rf"sensor {sensor} cannot be chosen from cell {cell}, with grid\.window=1"
-    ):
-        Policy.from_dense(windowed(), on)
-
-
-@pytest.mark.parametrize("t_max", [0, 2])
-def test_every_sensor_of_a_window_is_on_however_it_is_looked_up(t_max: int) -> None:
-    world = World(
-        random_kernel(np.random.default_rng(0), 20, 0.1), (4, 5), cost=0.1, t_max=t_max, window=1
-    )
-    everything = Policy.all_on(world)
-    cell = torch.arange(20).repeat_interleave(t_max + 2).view(2, -1)
-    state = TensorDict(
-        {
-            "last_cell": cell,
-            "steps_since_detection": torch.arange(t_max + 2).repeat(20).view(2, -1),
-        },
-        [2],
-    )
-    assert torch.equal(
-        everything(state.clone())["action"], Policy(world, everything.sets)(state.clone())["action"]
-    )
-    assert everything.sets is not None
-    assert (everything.sets.dtype, everything.sets.indices.dtype) == (np.bool_, np.int32)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("last_cell", -1),
-        ("last_cell", M),
-        ("steps_since_detection", -1),
-        ("steps_since_detection", CHOICES + 1),
-    ],
-)
-@pytest.mark.parametrize(
-    "acting",
-    [Policy.all_on(WORLD), Policy.from_dense(WORLD, table()), Policy.random_k(WORLD, 2)],
-)
-def test_a_state_that_is_none_is_refused(acting: Policy, key: str, value: int) -> None:
-    rows = {"last_cell": torch.tensor([1, 2]), "steps_since_detection": torch.tensor([0, 1])}
-    rows[key][1] = value
-    with pytest.raises(UserError, match=f"{key}={value}"):
-        acting(TensorDict(rows, [2]))

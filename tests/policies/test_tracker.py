@@ -1,4 +1,4 @@
-"""A tracker chooses as simulated episodes and the environment do, step by step, and refuses mistakes in one line."""
+"""A tracker chooses as simulated episodes and the environment do, step by step."""
 
 from __future__ import annotations
 
@@ -288,80 +288,3 @@ def begun(**more: Any) -> tm.Tracker:
     tracker = Policy.from_dense(small_world(), table).tracker(4, **more)
     tracker.sensors()
     return tracker
-
-
-MISTAKES: dict[str, tuple[Any, str]] = {
-    "second report": (lambda t: (t.report(0), t.report(0)), r"report: no sensors\(\) since"),
-    "outside": (lambda t: t.report(9), "report: cell=9: expected an integer from 0 to 8"),
-    "seen outside": (lambda t: t.sees(9), "sees: cell=9: expected an integer from 0 to 8"),
-    "no cell": (lambda t: t.report(False), "report: cell=False: expected"),
-    "fraction": (lambda t: t.report(0.5), "report: cell=0.5: expected"),
-    "off": (lambda t: t.report(5), "report: cell 5 is seen by none of the 2 sensors that are on"),
-    "mode": (lambda t: t.report(4, mode=1), "report: mode=1, expected none"),
-    "mode of nothing": (lambda t: t.report(None, mode=1), "report: mode=1 without a cell"),
-    "exited": (lambda t: (t.exited(), t.sensors()), r"sensors\(\): the target has exited"),
-    "exited twice": (lambda t: (t.exited(), t.exited()), r"exited\(\): the target has exited"),
-    "after the exit": (lambda t: (t.exited(), t.report(0)), "report: the target has exited"),
-    "start": (lambda _: begun(mode=1), "tracker: mode=1, expected none"),
-    "seed": (lambda _: begun(seed=-1), "tracker: seed=-1: expected an integer >= 0"),
-}
-
-
-@pytest.mark.parametrize("name", MISTAKES)
-def test_mistakes_end_in_one_line(name: str) -> None:
-    mistake, message = MISTAKES[name]
-    with pytest.raises(UserError, match=f"^{message}") as caught:
-        mistake(begun())
-    assert "\n" not in str(caught.value)
-
-
-def test_a_refused_report_changes_nothing() -> None:
-    tracker = begun()
-    before = tracker.state()
-    with pytest.raises(UserError):
-        tracker.report(5)
-    assert tracker.state() == before
-    tracker.report(4)
-
-
-def test_modes_are_asked_for_where_detections_give_them() -> None:
-    policy = some(WORLDS["mode"])
-    with pytest.raises(UserError, match=r"^tracker: mode=None, expected one of 0 \.\.\. 7$"):
-        policy.tracker(0)
-    with pytest.raises(UserError, match=r"^tracker: mode=8: expected an integer from 0 to 7"):
-        policy.tracker(0, mode=8)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"key": 99}, "state: key=99: expected an integer from 0 to 8"),
-        ({"misses": 3}, "state: misses=3: expected an integer from 0 to 2"),
-        ({"misses": None}, "state: misses=None: expected"),
-        ({"on": [9]}, "state: on=9: expected an integer from 0 to 8"),
-        ({"on": [0, 0]}, "state: on=[0, 0]: expected sensors that can be on, in order"),
-        ({"on": 3}, "state: expected a list or None as on"),
-        ({"exited": 1}, "state: expected True or False as exited"),
-        ({"task": {}}, "state: made for {}, expected {'size': "),
-        (
-            {"more": 1},
-            "state: expected a dict with belief, exited, key, misses, on, seed, steps, task",
-        ),
-    ],
-)
-def test_a_state_that_does_not_fit_is_refused(change: dict[str, Any], message: str) -> None:
-    policy = Policy.all_on(small_world())
-    state = policy.tracker(4).state()
-    with pytest.raises(UserError) as caught:
-        tm.Tracker.restore(policy, state | change)
-    assert str(caught.value).startswith(message)
-    with pytest.raises(UserError, match=r"^state: expected a dict"):
-        tm.Tracker.restore(policy, 5)  # type: ignore[arg-type]
-
-
-def test_a_state_of_another_memory_is_refused() -> None:
-    state = some(WORLDS["gaps"]).tracker(3).state()
-    with pytest.raises(
-        UserError, match=r"^state: made for .*displacement_gap.*, expected .*'cell'"
-    ):
-        tm.Tracker.restore(some(WORLD), state)

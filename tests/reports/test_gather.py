@@ -24,7 +24,7 @@ from trackmdp.reports import watch
 from trackmdp.reports.finished import MOST_POINTS, averaged_sets
 from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.page import build
-from trackmdp.reports.results import RESULTS, Results, load_results, save_results
+from trackmdp.reports.results import Results, load_results, save_results
 from trackmdp.sensing.task import Task
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluate import evaluate
@@ -126,28 +126,6 @@ def test_of_sensors_with_footprints_the_cells_in_view_are_drawn() -> None:
     ]
     everything = PolicyTable(task, PolicyTable.all_on(task).written).seen
     assert everything.toarray().all() and everything.shape == (3, 3)
-
-
-def test_stored_results_read_back_the_same_and_are_small(whole: Path, tmp_path: Path) -> None:
-    found = gather_runs(whole)
-    save_results(found, tmp_path)
-    read = load_results(tmp_path)
-    assert read.runs == found.runs
-    assert (read.anomalies, read.manifest) == (found.anomalies, found.manifest)
-    for one, other in zip(found.maps, read.maps, strict=True):
-        assert (one.label, one.size, one.averaged) == (other.label, other.size, other.averaged)
-        assert not (one.sets != other.sets).nnz and not (one.kernel != other.kernel).nnz
-        assert np.array_equal(one.value, other.value) and np.array_equal(one.bound, other.bound)
-    content = (tmp_path / RESULTS).read_bytes()
-    assert len(content) < 20_000
-    save_results(read, tmp_path)
-    assert (tmp_path / RESULTS).read_bytes() == content
-
-
-def test_no_path_of_the_machine_is_kept(sweep: Path, tmp_path: Path) -> None:
-    plan(sweep, "a2c-0.16-0")
-    save_results(gather_runs(sweep), tmp_path)
-    assert load_results(tmp_path).manifest["line"] == "trackmdp train -m"
 
 
 def test_a_curve_keeps_its_ends_and_few_points(sweep: Path) -> None:
@@ -320,26 +298,6 @@ def test_a_plan_of_rubbish_is_refused_in_one_line(name: object, sweep: Path) -> 
     with pytest.raises(UserError, match=r"sweep\.json") as caught:
         gather_runs(sweep)
     assert "\n" not in str(caught.value)
-
-
-def test_damaged_stored_results_are_refused_in_one_line(whole: Path, tmp_path: Path) -> None:
-    save_results(gather_runs(whole), tmp_path)
-    content, kept = (tmp_path / RESULTS).read_bytes(), load_results(tmp_path)
-    flipped = [
-        content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :]
-        for place in range(0, len(content), 211)
-    ]
-    refused = 0
-    for damaged in (b"PK", content[:-40], *flipped):
-        (tmp_path / RESULTS).write_bytes(damaged)
-        try:
-            found = load_results(tmp_path)
-        except UserError as error:
-            assert RESULTS in str(error) and "\n" not in str(error)
-            refused += 1
-        else:  # a bit that has no meaning, as in a date of the archive
-            assert (found.runs, found.manifest) == (kept.runs, kept.manifest)
-    assert refused > len(flipped) / 2
 
 
 EVIL = ["=<script>alert(1)<@BODY@", "@$x^{$\\input{x}{}~^&%#_", "\x1b]0;t\x07a\nb\u202e", "[x]"]

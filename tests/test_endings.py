@@ -1,0 +1,182 @@
+"""How a command ends: on Ctrl-C, closed streams, a full disk, a breakdown."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.typed import ENVIRONMENT, refused, stub
+from trackmdp.app import launch
+from trackmdp.app.cli import main
+from trackmdp.errors import Preempted, RunError, UserError
+from trackmdp.solvers import optimal
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+
+def test_ctrl_c_ends_in_one_line_and_130(empty_folder: Path) -> None:
+    code = """
+import sys, types, threading
+module = types.ModuleType("trackmdp.app.commands.train")
+module.run = lambda *_: threading.Event().wait(60)
+sys.modules[module.__name__] = module
+from trackmdp.app.cli import main
+from trackmdp.app.sweep.plan import sweep_name
+sys.exit(main(["train"]))
+"""
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=ENVIRONMENT,
+        # The tests may run in the background, where a shell has Ctrl-C ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("train ")
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert (process.returncode, said) == (130, "trackmdp train: interrupted\n")
+    assert not list(empty_folder.iterdir())
+
+
+@pytest.mark.parametrize("words", [["--version"], ["solve", "grid.size=2"]])
+def test_closed_streams_are_no_mistake(words: list[str]) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "trackmdp", *words],
+        env=ENVIRONMENT,
+        preexec_fn=lambda: (os.close(1), os.close(2)),
+        check=False,
+    )
+    assert done.returncode == (2 if "solve" in words else 0)
+
+
+class Interrupted:
+    def __set_name__(self, *_: object) -> None:
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("moment", ["a class is made", "a config is composed"])
+def test_ctrl_c_behind_another_error_is_one_line(
+    moment: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object) -> None:
+        if moment == "a class is made":
+            type("Config", (), {"option": Interrupted()})  # in Python 3.11 a RuntimeError
+        try:
+            raise KeyboardInterrupt
+        finally:
+            {}["half made"]
+
+    monkeypatch.setattr(launch, "launch", interrupted)
+    assert main(["solve"]) == 130
+    assert capsys.readouterr() == ("", "trackmdp solve: interrupted\n")
+
+
+def test_errors_that_are_behind_each_other_are_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As those of a file of options that asks for code."""
+
+    def fails(*_: object) -> None:
+        first, second = UserError("first"), UserError("second")
+        second.__context__ = first
+        raise first from second
+
+    monkeypatch.setattr(launch, "launch", fails)
+    assert refused(capsys, "solve") == "first"
+
+
+@pytest.mark.parametrize("kernel", ["random_support", "heading"])
+@pytest.mark.parametrize("command", ["evaluate", "compare"])
+def test_ctrl_c_in_the_search_for_a_baseline_writes_nothing(
+    command: str,
+    kernel: str,
+    monkeypatch: pytest.MonkeyPatch,
+    empty_folder: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def search(run: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(optimal._Run, "search", search)
+    baselines = ["baseline=optimal", *(["baseline=none"] if command == "compare" else [])]
+    words = [*baselines, f"kernel={kernel}", "grid.size=3", "quiet=true"]
+    assert main([command, *words, "hydra.run.dir=a"]) == 130
+    assert capsys.readouterr() == ("", f"trackmdp {command}: interrupted\n")
+    assert not list(empty_folder.iterdir())
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="has no /dev/full")
+@pytest.mark.parametrize(
+    "words",
+    [
+        "solve grid.size=4",
+        "train --help",
+        "train --help all",
+        "train --info all",
+        "train --cfg all",
+    ],
+)
+def test_a_full_disk_under_standard_output_is_one_line(words: str, empty_folder: Path) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "trackmdp.app.cli", *words.split()],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=ENVIRONMENT,
+            check=False,
+        )
+    line = f"trackmdp: standard output: {os.strerror(errno.ENOSPC)}\n"
+    assert (done.returncode, done.stderr) == (1, line)
+    assert not list(empty_folder.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "line"),
+    [
+        (RunError("iteration 3: the loss is not finite"), 1, "iteration 3: the loss is not finite"),
+        (Preempted(signal.SIGTERM), 143, "stopped by signal 15"),
+    ],
+)
+def test_a_run_that_breaks_down_ends_in_one_line(
+    error: BaseException,
+    status: int,
+    line: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def run(cfg: Any, folder: Path) -> None:
+        raise error
+
+    stub(monkeypatch, "train", run)
+    assert main(["train"]) == status
+    assert capsys.readouterr().err == f"trackmdp train: {line}\n"
+
+
+def test_on_windows_one_line_says_where_it_runs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("platform.system", lambda: "Windows")
+    assert "Linux in WSL" in refused(capsys, "train")
+
+
+def test_a_current_folder_that_was_removed_is_named(
+    empty_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty_folder.rmdir()
+    try:
+        assert main(["solve", "grid.size=3"]) == 2
+    finally:
+        os.chdir(empty_folder.parent)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "current folder" in line
