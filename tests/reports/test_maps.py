@@ -10,9 +10,11 @@ from scipy import sparse
 
 from tests.reports.sweeps import write_sweep
 from trackmdp.reports import maps
+from trackmdp.reports.finished import after_a_miss
 from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.idea import idea_figure, scenes
 from trackmdp.reports.results import Mapped
+from trackmdp.world.model import World
 
 
 @pytest.fixture(scope="module")
@@ -24,9 +26,10 @@ def by_hand(
     sets: np.ndarray, kernel: np.ndarray, size: tuple[int, int], *, averaged: bool = False
 ) -> Mapped:
     zeros = np.zeros(len(kernel))
+    after = kernel * (1 - sets[:: len(sets) // len(kernel)]) @ kernel
     return Mapped(
         *("w", "m", "0", size, averaged, sparse.csr_array(sets), zeros),
-        *(sparse.csr_array(kernel), zeros, np.full(len(kernel), np.nan)),
+        *(sparse.csr_array(kernel), sparse.csr_array(after), zeros, np.full(len(kernel), np.nan)),
     )
 
 
@@ -38,7 +41,8 @@ def test_a_map_draws_the_possible_cells(drawn: list[Mapped]) -> None:
         if n == 0:
             assert possible == (each.kernel.toarray()[located] > 0).sum()  # type: ignore[call-overload]
     assert len([row for row in figure.table.rows if row[1] == 0]) == 9
-    everything = replace(each, sets=sparse.csr_array(np.ones(each.sets.shape)))
+    ones, none = np.ones(each.sets.shape), np.zeros(each.kernel.shape)
+    everything = replace(each, sets=sparse.csr_array(ones), after=sparse.csr_array(none))
     without = maps.policy_map("name", everything)
     assert {row[1] for row in without.table.rows} == {0}, "no miss can happen: no second set"
 
@@ -140,3 +144,22 @@ def test_where_no_miss_can_be_made_good_there_is_no_story() -> None:
     assert idea_figure(line_of_four([1, 1, 1, 0])) is None
     once = line_of_four([0] * 4)
     assert scenes(replace(once, sets=once.on(0))) == []
+
+
+def test_after_a_miss_a_target_goes_on_in_its_mode_and_may_be_where_a_sensor_missed_it() -> None:
+    """A row of five cells; mode 0 goes right, mode 1 left, as often: the average of both would turn around."""
+    moves = np.zeros((5, 2, 5, 2))
+    for x in range(4):
+        moves[x, 0, x + 1, 0] = moves[4 - x, 1, 3 - x, 1] = 0.9
+    world = World(moves.reshape(10, 10), (1, 5), cost=0.1, modes=2)
+    dark = sparse.csr_array((5, 5))
+    assert after_a_miss(world, dark).toarray()[2].nonzero()[0].tolist() == [0, 4]
+    stay = World(0.9 * np.eye(5), (1, 5), cost=0.1, detection=[1, 0.5, 0.5, 1, 1])
+    found = after_a_miss(stay, sparse.csr_array(np.eye(5))).toarray()
+    assert found == pytest.approx(np.diag([0, 0.405, 0.405, 0, 0]))
+
+
+def test_where_a_sensor_misses_there_is_no_story() -> None:
+    drawn = line_of_four([0, 0, 0, 1])
+    missing = drawn.after + sparse.csr_array(0.1 * np.eye(4))
+    assert scenes(drawn) and not scenes(replace(drawn, after=missing))

@@ -128,7 +128,7 @@ def panels(study: Study) -> list[Panel]:
     ]
 
 
-_PLAIN = re.compile(r"(\w+(=[a-z\d_.]+)?(, |$))+")
+_PLAIN = re.compile(r"([\w.]+(=[a-z\d_.]+)?(, |$))+")
 """A title of choices and numbers."""
 
 

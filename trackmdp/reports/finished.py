@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.entries import per_row
+from trackmdp.arrays.entries import per_row, summing
 from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.config.tree import flatten
 from trackmdp.errors import UserError
@@ -20,7 +20,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.reports.maps import MOST_MAP_CELLS
 from trackmdp.reports.results import FIGURES, HELD_OUT, FinishedRun, Mapped, checked
 from trackmdp.solvers import bounds, rules
-from trackmdp.solvers.hidden import averaged
+from trackmdp.solvers.hidden import averaged, mode_shares
 from trackmdp.solvers.linear import DIRECT_CELLS
 from trackmdp.solvers.value import key_visits, value_of
 from trackmdp.training.folders import METRICS, SUMMARY, check_files, read_summary
@@ -153,6 +153,7 @@ def read_map(place: Path, run: FinishedRun, world: str, method: str) -> Mapped |
         sets=sets.astype(np.float64),
         value=value,
         kernel=kernel,
+        after=after_a_miss(problem, sets[:: problem.num_choices]),
         bound=bound,
         qmdp=simple,
     )
@@ -177,6 +178,20 @@ def averaged_sets(table: PolicyTable, sets: sparse.csr_array, visits: Array) -> 
         np.float64
     )
     return sparse.csr_array(found).sorted_indices()
+
+
+def after_a_miss(problem: World, first: sparse.csr_array) -> sparse.csr_array:
+    """`Mapped.after`, with the cells in view `first` `[M, M]` at once after a detection.
+
+    Along the hidden states: the next move may depend on the last one. In a cell in view a miss has probability 1 - p_d.
+    """
+    m = problem.num_cells
+    if m > MOST_MAP_CELLS:
+        return sparse.csr_array((m, m))
+    of_cell = summing(problem.motion.cell, m)
+    mass = of_cell @ sparse.diags_array(mode_shares(problem)) @ problem.kernel
+    missed = mass - mass.multiply(first.multiply(problem.detection) @ of_cell)
+    return sparse.csr_array(missed @ problem.kernel @ of_cell.T).sorted_indices()
 
 
 def _references_by_cell(problem: World) -> tuple[sparse.csr_array, Array, Array]:

@@ -53,12 +53,12 @@ def policy_map(name: str, drawn: Mapped) -> Figure:
         return _shaded(f"sets-{name}", f"Number of {title.lower()}", counts, drawn.size, "sensors")
     # `[n][M, M]`, row x: with the target last located in x.
     sets = [drawn.on(n).toarray() for n in range(drawn.choices)]
-    possible = _possible(sets, drawn, len(shown))
+    possible = [mass.toarray() > 0 for mass in (drawn.kernel, drawn.after)]
     # A stored plan has a set for each n, also where that many misses cannot happen.
     sensed = [sets[n] * possible[n].any(axis=1, keepdims=True) for n in shown]
     # One size of tile for all, by the farthest cell drawn.
     reach = max(
-        _farthest(can | (on > 0), drawn.size) for can, on in zip(possible, sensed, strict=True)
+        _farthest(can | (on > 0), drawn.size) for can, on in zip(possible, sensed, strict=False)
     )
 
     def paint(figure: Canvas) -> None:
@@ -183,17 +183,6 @@ def binned(values: Array, size: _Size) -> Array:
     sums = np.add.reduceat(sums, begins[1], axis=1)
     rows, columns = (np.diff([*begin, length]) for begin, length in zip(begins, size, strict=True))
     return sums / (rows[:, None] * columns)
-
-
-def _possible(sets: Sequence[Array], drawn: Mapped, steps: int) -> list[BoolArray]:
-    """`[M, M]` each: cells where the target may be after n misses and one more move."""
-    # `[M, M]` joint mass: row x, the target located in x and moved once. Sensed mass would have been located.
-    mass = drawn.kernel.toarray()
-    found = []
-    for n in range(steps):
-        found.append(mass > 0)
-        mass = (mass * (1.0 - sets[n])) @ drawn.kernel
-    return found
 
 
 def _draw_tiles(axes: Axes, on: Array, possible: BoolArray, size: _Size, reach: int) -> None:

@@ -22,7 +22,7 @@ from trackmdp.world.problem_file import as_arrays, from_arrays
 
 RESULTS = "results.npz"
 # Raised by 1 when the meaning of the content changes: a file of another format is refused.
-FORMAT = "trackmdp results 4"
+FORMAT = "trackmdp results 5"
 _LARGEST = 2**30
 """Bytes of the longest file that is read."""
 
@@ -117,6 +117,7 @@ class Mapped:
         sets: `[M (t_max + 1), M]`, row x (t_max + 1) + n: 1 for cells sensed at n misses after a detection in x.
         value: `[M]`, exact expected reward of an episode from each start cell.
         kernel: `[M, M]`, the motion; without entries on large grids.
+        after: `[M, M]`, row x: where the target is after a detection in x, a miss and one more move; as `kernel`.
         bound: `[M]`, clocked bound on `value`.
         qmdp: `[M]`, exact value of Q_MDP; nan where unknown.
     """
@@ -129,6 +130,7 @@ class Mapped:
     sets: sparse.csr_array
     value: Array
     kernel: sparse.csr_array
+    after: sparse.csr_array
     bound: Array
     qmdp: Array
 
@@ -219,7 +221,7 @@ def _mapped(place: int, given: Mapping[str, Any]) -> Mapped:
     rows, columns = parts["size"].tolist()
     found = Mapped(**parts | {"size": (rows, columns)})
     lengths = {len(each) for each in (found.value, found.bound, found.qmdp)}
-    shapes = {*found.kernel.shape, found.sets.shape[1]}
+    shapes = {*found.kernel.shape, *found.after.shape, found.sets.shape[1]}
     if lengths | shapes != {rows * columns}:
         raise ValueError(f"map {place}: arrays of other lengths than its {rows * columns} cells")
     return found

@@ -18,7 +18,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.arrays.entries import per_row, summing
-from trackmdp.arrays.types import AnyArray
+from trackmdp.arrays.types import AnyArray, Array
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers import optimal
@@ -273,15 +273,21 @@ def revealing(world: World) -> World:
 
 
 def averaged(world: World) -> World:
-    """The motion to a tracker that knows of no modes: each cell's moves, averaged over its modes as they occur.
+    """The motion to a tracker that knows of no modes: each cell's moves, averaged over its modes as they occur."""
+    if world.modes == 1:
+        return world
+    of_cell = summing(world.motion.cell, world.num_cells)
+    kernel = of_cell @ sparse.diags_array(mode_shares(world)) @ world.kernel @ of_cell.T.tocsr()
+    return World.of(world, kernel, memory="cell", revealed=1, markov=True)
+
+
+def mode_shares(world: World) -> Array:
+    """`[Z]` how often each mode occurs in its cell; they add up to 1 in each cell.
 
     Sensing does not move the target, so the expected visits (I - Q^T)^-1 s of an episode are the same for all policies.
     """
-    if world.modes == 1:
-        return world
     cell, states = world.motion.cell, world.num_states
+    if world.modes == 1:
+        return np.ones(states)
     visits = accumulate(sparse.csr_array(world.kernel.T), np.full(states, 1.0 / states))
-    share = visits / per_row(cell, visits, world.num_cells)[cell]
-    of_cell = summing(cell, world.num_cells)
-    kernel = of_cell @ sparse.diags_array(share) @ world.kernel @ of_cell.T.tocsr()
-    return World.of(world, kernel, memory="cell", revealed=1, markov=True)
+    return visits / per_row(cell, visits, world.num_cells)[cell]
