@@ -99,8 +99,11 @@ def test_corners_are_those_of_all_policies(name: str) -> None:
     np.testing.assert_allclose(corners, hull_of(points), rtol=0, atol=1e-7)
     assert len(corners) >= 3
     assert made.certified
-    bounds = [made.bound(sensors) for sensors in points[:, 0]]
-    assert (points[:, 1] <= np.array(bounds) + 1e-8).all()
+    # Of policies with as many sensors the one of the greatest net.
+    most = points[np.lexsort((-points[:, 1], points[:, 0].round(4)))]
+    most = most[np.unique(most[:, 0].round(4), return_index=True)[1]]
+    bounds = [made.bound(sensors) for sensors in most[:, 0]]
+    assert (most[:, 1] <= np.array(bounds) + 1e-8).all()
 
 
 @pytest.mark.parametrize("safe_cost", [None, 0.0])

@@ -237,13 +237,8 @@ def test_a_run_goes_on_with_its_own_kernel_whatever_became_of_the_file(
 
 
 @pytest.mark.parametrize("algo", ["hindsight", "model_based"])
-@pytest.mark.parametrize("later", ["another map", "no map"])
 def test_a_map_of_classes_is_kept_and_no_other_one_taken(
-    algo: str,
-    later: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     classes, file = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1]), tmp_path / "map.npy"
     np.save(file, classes)
@@ -251,22 +246,19 @@ def test_a_map_of_classes_is_kept_and_no_other_one_taken(
         f"algo.share_cells={file}",
         *(SMALL["hindsight"] if algo == "hindsight" else [f"algo={algo}"]),
     ]
-    command = [*words, *QUICK, *BUDGET, "resume=auto", f"hydra.run.dir={tmp_path / 'run'}"]
-    for folder in ("whole", "run"):
-        with monkeypatch.context() as patch:
-            if folder == "run":
-                at_iteration(patch, 5, breaks)
-            assert main(["train", *command[:-1], f"hydra.run.dir={tmp_path / folder}"]) == (
-                folder == "run"
-            )
+    command = ["train", *words, *QUICK, *BUDGET]
+    assert main([*command, f"hydra.run.dir={tmp_path / 'whole'}"]) == 0
+    with monkeypatch.context() as patch:
+        at_iteration(patch, 5, breaks)
+        assert main([*command, f"hydra.run.dir={tmp_path / 'run'}"]) == 1
+    shutil.copytree(tmp_path / "run", tmp_path / "moved")
     file.unlink()
-    if later == "another map":
-        np.save(file, np.zeros(9))
-    assert main(["train", *command]) == 0
-    assert_same_run(tmp_path / "run", tmp_path / "whole")
-    assert (tmp_path / "run" / "policy.npz").read_bytes() == (
-        tmp_path / "whole" / "policy.npz"
-    ).read_bytes()
+    for folder in ("run", "moved"):
+        assert main([*command, "resume=auto", f"hydra.run.dir={tmp_path / folder}"]) == 0
+        assert_same_run(tmp_path / folder, tmp_path / "whole")
+        written = [(tmp_path / name / "policy.npz").read_bytes() for name in (folder, "whole")]
+        assert written[0] == written[1]
+        np.save(file, np.zeros(9))  # the second time there is another map
     kept = tmp_path / "run" / PROBLEM
     kept.write_bytes(problem_bytes(read_problem(kept), 1 - classes))
     capsys.readouterr()

@@ -284,5 +284,5 @@ def test_a_run_has_its_threads_until_its_end(monkeypatch: pytest.MonkeyPatch) ->
         seen.append(torch.get_num_threads())
 
     monkeypatch.setattr(run, "_several", beside)
-    summary = train(small_world(), "a2c", threads=2, **QUICK).summary
+    summary = train(small_world(), "a2c", threads=2, **QUICK | {"total_frames": 256}).summary
     assert [*seen, summary["machine"]["torch_threads"], torch.get_num_threads()] == [2, 2, 1]
