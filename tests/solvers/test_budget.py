@@ -56,7 +56,7 @@ def test_a_budget_above_all_sensors_is_none() -> None:
 )
 def test_no_policy_with_a_budget_is_above_the_dual_over_prices(seed: int) -> None:
     world = tiny(seed, 1)
-    dual = frontier(world.but(cost=0.2), near=1.0)
+    dual = frontier(world.but(cost=0.2, budget=None), near=1.0)
     for price in (0.0, 0.2):
         best = float(best_of_all(world.but(cost=price)).mean())
         assert best <= dual.worth(1.0, price) + 1e-9

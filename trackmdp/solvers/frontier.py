@@ -87,7 +87,9 @@ def frontier(
         >>> found.certified, found.corners[0].sensors, round(found.corners[-1].accuracy, 6)
         (True, 0.0, 1.0)
     """
-    if near is not None and not near >= 0:  # nor nan
+    if near is not None and not (
+        isinstance(near, int | float | np.number) and near >= 0
+    ):  # nor nan
         raise UserError(f"near={near}: expected a number of sensors >= 0")
     own = {f"solver.{name}": value for name, value in options.items()}
     named = {"solver": solver, "solver.nodes": nodes, "solver.time_limit": time_limit}
@@ -105,10 +107,13 @@ def trace(
     """`frontier` with the solver of a config.
 
     Raises:
-        UserError: there is no motion model, episodes are cut, or the target is never in the grid after its start.
+        UserError: there is no motion model, a step has a budget, episodes are cut, or the target is never in the grid
+            after its start.
     """
     check_problem(problem, "frontier")
-    world = modelled(problem, "frontier").but(budget=None)
+    world = modelled(problem, "frontier")
+    if world.budget is not None:
+        raise UserError(f"budget={world.budget}: expected None, any number of sensors in a step")
     if world.max_steps is not None:
         raise UserError(
             f"grid.max_steps={world.max_steps}: only whole episodes are solved, expected null"
