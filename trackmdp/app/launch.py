@@ -248,6 +248,8 @@ def answer(compose: Composer, args: argparse.Namespace) -> bool:
     with redirect_stdout(io.StringIO()) as answered:
         try:
             if args.cfg:
+                # It is composed: Hydra's own command would do so once more.
+                hydra.compose_config = lambda **_: cfg  # type: ignore[method-assign]
                 hydra.show_cfg(compose.name, compose.words, args.cfg, args.package, args.resolve)
             elif args.info:
                 hydra.show_info(args.info, compose.name, compose.words)
