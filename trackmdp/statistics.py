@@ -57,7 +57,7 @@ def mean_over_groups(groups: Sequence[Sequence[float]]) -> MeanInterval:
     # Welch-Satterthwaite: ν = (Σ v_g)² / Σ (v_g² / (n_g - 1)). For G = 1 that is n - 1; for G equal groups of n it is
     # G (n - 1).
     freedom = variance**2 / (parts**2 / [len(group) - 1 for group in filled]).sum()
-    margin = _student(freedom) * math.sqrt(variance)
+    margin = student(freedom) * math.sqrt(variance)
     return MeanInterval(mean, mean - margin, mean + margin, count)
 
 
@@ -134,7 +134,7 @@ def _bootstrap_t(part: Values, whole: Values, mean: float) -> tuple[float, float
     # Delta method: part/whole - mean ≈ mean(part - mean·whole) / mean(whole), a mean over n units.
     error = float(rest.std(ddof=1) / (whole.mean() * math.sqrt(count)))
     if not _FEW <= count <= _MANY or not error:
-        return _by_student(mean, error, count)
+        return _bystudent(mean, error, count)
     rng = np.random.default_rng(derive(0, "bootstrap"))
     # `[resamples, n]`: how often each unit is in each resample, so that all resampled sums are one matrix product. The
     # generator is seeded with a constant: the same figures give the same interval in every report.
@@ -154,20 +154,20 @@ def _bootstrap_t(part: Values, whole: Values, mean: float) -> tuple[float, float
         statistic = (ratios - mean) / (np.sqrt(squares * count / (count - 1)) / base)
     spread = np.isfinite(statistic)
     if 1.0 - spread.mean() > (1 - LEVEL) / 2:  # the quantile would be one of those without any
-        return _by_student(mean, error, count)
+        return _bystudent(mean, error, count)
     low, high = np.quantile(statistic[spread], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     # The quantiles change sides: t = (estimate - truth) / error is at most `high` exactly where truth is at least
     # estimate - high·error.
     return float(mean - high * error), float(mean - low * error)
 
 
-def _by_student(mean: float, error: float, count: int) -> tuple[float, float]:
+def _bystudent(mean: float, error: float, count: int) -> tuple[float, float]:
     """The ends of Student's interval."""
-    margin = _student(count - 1) * error
+    margin = student(count - 1) * error
     return mean - margin, mean + margin
 
 
-def _student(freedom: float) -> float:
+def student(freedom: float) -> float:
     """The quantile (1 + `LEVEL`) / 2 of Student's t."""
     from scipy.special import stdtrit  # a quarter of a second to load
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from trackmdp.arrays.types import Array
 from trackmdp.notebook.card import Card, Carded, counted_words, decimal
-from trackmdp.statistics import MeanInterval, ratio
+from trackmdp.statistics import MeanInterval, ratio, student
 
-_HALF = 1.96
-"""Of a 95 % interval, in standard errors; there are many episodes."""
+_FREE = 3
+"""Degrees of freedom that the corrected mean takes: the mean and two slopes."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -46,18 +46,20 @@ class GroupEvaluation(Carded):
         """Expected reward of an episode.
 
         Most of its variance is that of two figures of the motion alone, whose means are known: it is taken out by
-        least squares (control variates).
+        least squares (control variates), whose own error counts (Student's t). Of few episodes it is a plain mean.
         """
         count, reward = len(self.totals), self.totals[:, 0]
         if self.exact:
             return MeanInterval(float(reward[0]), float(reward[0]), float(reward[0]), 1)
-        if self.controls is None:
+        if self.controls is None or count <= _FREE:
             return ratio(reward, np.ones(count))
-        columns = self.totals[:, [1, 6]] - self.totals[:, [1, 6]].mean(axis=0)
+        shown = self.totals[:, [1, 6]].mean(axis=0)
+        columns, apart = self.totals[:, [1, 6]] - shown, shown - self.controls
         slope = np.linalg.lstsq(columns, reward, rcond=None)[0]
-        mean = float((reward - (self.totals[:, [1, 6]] - self.controls) @ slope).mean())
-        rest = reward - reward.mean() - columns @ slope
-        half = _HALF * math.sqrt(float((rest**2).sum()) / max(count - 3, 1) / count)
+        mean = float(reward.mean() - apart @ slope)
+        rest, freedom = reward - reward.mean() - columns @ slope, count - _FREE
+        share = 1.0 / count + float(apart @ np.linalg.pinv(columns.T @ columns) @ apart)
+        half = student(freedom) * math.sqrt(float((rest**2).sum()) / freedom * share)
         return MeanInterval(mean, mean - half, mean + half, count)
 
     @property

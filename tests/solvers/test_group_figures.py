@@ -1,0 +1,29 @@
+"""Intervals of the figures of several targets."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from trackmdp.solvers.several.group_figures import GroupEvaluation
+
+
+@pytest.mark.parametrize("count", [3, 4, 6, 12])
+def test_intervals_of_few_episodes_cover_what_they_say(count: int) -> None:
+    rng = np.random.default_rng(1)
+    steps, known, rest = rng.normal([[[5.0]], [[1.0]], [[2.0]]], 1.0, (3, 400, count))
+    covered = 0
+    for each in zip(steps + known / 2 + rest, steps, known, strict=True):
+        totals = np.zeros((count, 7))
+        totals[:, [0, 1, 6]] = np.transpose(each)
+        found = GroupEvaluation(totals, False, 5.0, (5.0, 1.0)).aihtr
+        assert found.low is not None
+        assert found.high is not None
+        covered += found.low <= 7.5 <= found.high
+    assert 0.91 < covered / 400 < 0.98
+
+
+def test_two_episodes_have_no_interval() -> None:
+    found = GroupEvaluation(np.arange(14.0).reshape(2, 7), False, 5.0, (5.0, 1.0))
+    assert found.aihtr.low is None
+    assert found.reward_per_step.low is None
