@@ -108,11 +108,11 @@ def test_every_row_counts_up_to_its_first_end() -> None:
 
 
 def test_standard_errors_are_those_of_independent_runs() -> None:
-    """Over 100 simulations of 100 episodes, the estimates spread as their standard errors say."""
+    """Over 200 simulations of 200 episodes, the estimates spread as their standard errors say."""
     world, chains = small_world(t_max=1, exit_probability=0.4), np.zeros((9, 2, 9), dtype=bool)
     chains[:, :, :5] = True
     policy = Policy.from_dense(world, chains)
-    runs = [simulate(world, policy, 100, seed=seed).figures() for seed in range(100)]
+    runs = [simulate(world, policy, 200, seed=seed).figures() for seed in range(200)]
     for key in FIGURES:
         estimates = [getattr(run, key) for run in runs]
         spread = np.std([estimate.mean for estimate in estimates])
