@@ -66,6 +66,7 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
             "file=möß.mcap: expected option=value (a value with commas or letters beyond a to z needs quotes: ",
         ),
         ("train seed=0,1", "seed=0,1: expected one value; add -m"),
+        ("train algo=[a2c,ppo]", "algo=[a2c,ppo]: expected one choice, not a list"),
         ("train -m seed=range(10000000)", "seed=range(10000000): expected at most 100,000 values"),
         (
             "train -m seed=range(1000) kernel.seed=range(1000)",

@@ -118,6 +118,9 @@ def _refuse_wrong(error: Exception, command: str, words: Sequence[str], compose:
         _check_file(override, str(error))
     for override in groups:
         _check_choice(override, str(error))
+        one = not several(ROOTS[command], override.key_or_group)
+        if one and isinstance(override.value(), list):
+            raise UserError(f"{override.input_line}: expected one choice, not a list")
     # The options depend on the choices: in algo=a2c,ppo algo.epochs is an option of one of them. The first
     # combination that composes and shows a mistake decides.
     for choices in itertools.product(*map(_single_words, [*files, *groups])):
