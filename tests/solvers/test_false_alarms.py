@@ -263,9 +263,9 @@ def test_the_command_values_a_baseline_and_a_trained_policy(tmp_path: Path) -> N
     [
         (
             ["solve"],
-            "sensor=false_alarm: expected perfect or miss; policies are evaluated with false alarms",
+            "sensor=false_alarm: expected perfect, miss or footprint; policies are evaluated with false alarms",
         ),
-        (["train"], "sensor=false_alarm: expected perfect or miss"),
+        (["train"], "sensor=false_alarm: expected perfect, miss or footprint"),
         (
             ["evaluate", "baseline=clocked", "sensor.p_f=1"],
             "sensor.p_f=1.0: expected a number >= 0 and < 1",

@@ -184,7 +184,7 @@ class FalseAlarmConfig(SensorConfig):
             raise refuse(
                 key,
                 self.name,
-                "perfect or miss; policies are evaluated with false alarms, never made for them",
+                "perfect, miss or footprint; policies are evaluated with false alarms, never made for them",
             )
         if root.log:
             raise refuse(
