@@ -117,10 +117,7 @@ def _refuse_wrong(error: Exception, command: str, words: Sequence[str], compose:
     for override in files:
         _check_file(override, str(error))
     for override in groups:
-        _check_choice(override, str(error))
-        one = not several(ROOTS[command], override.key_or_group)
-        if one and isinstance(override.value(), list):
-            raise UserError(f"{override.input_line}: expected one choice, not a list")
+        _check_choice(override, command, str(error))
     # The options depend on the choices: in algo=a2c,ppo algo.epochs is an option of one of them. The first
     # combination that composes and shows a mistake decides.
     for choices in itertools.product(*map(_single_words, [*files, *groups])):
@@ -145,9 +142,11 @@ def _check_groups(overrides: Sequence[Override], command: str) -> None:
             raise UserError(f"{override.input_line}: {command} has no {group}")
 
 
-def _check_choice(override: Override, message: str) -> None:
-    """Refuse a choice that Hydra did not find, by its message `message`."""
+def _check_choice(override: Override, command: str, message: str) -> None:
+    """Refuse a list where one choice is expected, or a choice that Hydra did not find, by its message `message`."""
     group = override.key_or_group
+    if isinstance(override.value(), list) and not several(ROOTS[command], group):
+        raise UserError(f"{override.input_line}: expected one choice, not a list")
     for value in _names(override):
         # Hydra has `find` for a single choice and `load` of one in a list.
         missing = any(f"Could not {verb} '{group}/{value}" in message for verb in ("find", "load"))
