@@ -134,7 +134,7 @@ def _bootstrap_t(part: Values, whole: Values, mean: float) -> tuple[float, float
     # Delta method: part/whole - mean ≈ mean(part - mean·whole) / mean(whole), a mean over n units.
     error = float(rest.std(ddof=1) / (whole.mean() * math.sqrt(count)))
     if not _FEW <= count <= _MANY or not error:
-        return _bystudent(mean, error, count)
+        return _by_student(mean, error, count)
     rng = np.random.default_rng(derive(0, "bootstrap"))
     # `[resamples, n]`: how often each unit is in each resample, so that all resampled sums are one matrix product. The
     # generator is seeded with a constant: the same figures give the same interval in every report.
@@ -154,14 +154,14 @@ def _bootstrap_t(part: Values, whole: Values, mean: float) -> tuple[float, float
         statistic = (ratios - mean) / (np.sqrt(squares * count / (count - 1)) / base)
     spread = np.isfinite(statistic)
     if 1.0 - spread.mean() > (1 - LEVEL) / 2:  # the quantile would be one of those without any
-        return _bystudent(mean, error, count)
+        return _by_student(mean, error, count)
     low, high = np.quantile(statistic[spread], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     # The quantiles change sides: t = (estimate - truth) / error is at most `high` exactly where truth is at least
     # estimate - high·error.
     return float(mean - high * error), float(mean - low * error)
 
 
-def _bystudent(mean: float, error: float, count: int) -> tuple[float, float]:
+def _by_student(mean: float, error: float, count: int) -> tuple[float, float]:
     """The ends of Student's interval."""
     margin = student(count - 1) * error
     return mean - margin, mean + margin
