@@ -14,8 +14,7 @@ from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.several import group_bounds as group_bounds
-from trackmdp.solvers.several import group_value as group_value
+from trackmdp.solvers.several import group_bounds
 from trackmdp.solvers.several.group_bounds import equal_shares, upper_bound
 from trackmdp.solvers.several.group_chain import explored
 from trackmdp.solvers.several.group_value import evaluate_group

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -15,8 +16,7 @@ from trackmdp.app.cli import main
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.several import group_bounds as group_bounds
-from trackmdp.solvers.several import group_value as group_value
+from trackmdp.solvers.several import group_value
 from trackmdp.world.group import Group
 
 
@@ -48,6 +48,10 @@ def test_words_without_effect_are_refused(
 def test_a_width_that_no_interval_has_is_refused(width: Any) -> None:
     with pytest.raises(UserError, match=f"width={width}: expected a number > 0"):
         evaluate(Group([tiny(0)] * 2), "none", width=width)
+
+
+def test_a_width_may_be_any_real_number() -> None:
+    assert evaluate(Group([tiny(0)] * 2), "none", width=np.float32(0.5)).exact
 
 
 def test_a_width_that_is_never_reached_ends_at_the_most_episodes(

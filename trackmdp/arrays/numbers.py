@@ -18,6 +18,8 @@ from trackmdp.errors import UserError
 Range: TypeAlias = tuple[Callable[[Array], BoolArray], str]
 """A test of numbers, and its range in words."""
 
+REAL = (int, float, np.integer, np.floating)
+"""Kinds of a real number."""
 PRICES: Range = (
     lambda price: np.isnan(price) | ((price >= 0) & (price <= LARGEST_PRICE)),
     "a number from 0 to 1e15, or nan where there is no sensor",

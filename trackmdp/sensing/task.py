@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.arrays.numbers import PRICES, PROBABILITIES, one_each, whole_number
+from trackmdp.arrays.numbers import PRICES, PROBABILITIES, REAL, one_each, whole_number
 from trackmdp.arrays.types import AnyArray, Array, BoolArray
 from trackmdp.config.sensors import LARGEST_PRICE
 from trackmdp.config.world import LARGEST_CLIP, MEMORIES
@@ -367,6 +367,6 @@ def window_cells(size: tuple[int, int], window: int) -> sparse.csr_array:
 
 
 def _price(name: str, value: float, most: float = LARGEST_PRICE) -> float:
-    if not isinstance(value, int | float | np.number) or not 0 <= value <= most:
+    if not isinstance(value, REAL) or not 0 <= value <= most:
         raise UserError(f"{name}={value}: expected a number from 0 to {most:g}")
     return float(value)

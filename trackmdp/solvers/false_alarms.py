@@ -13,6 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.arrays.entries import per_row, ranks
+from trackmdp.arrays.numbers import REAL
 from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
@@ -79,8 +80,7 @@ def check_alarms(problem: Problem, false_alarm: float) -> World:
     world = modelled(problem, source)
     expected = {
         "targets without modes": world.modes == 1,
-        "a probability below 1": isinstance(false_alarm, int | float | np.number)
-        and 0.0 <= false_alarm < 1.0,
+        "a probability below 1": isinstance(false_alarm, REAL) and 0.0 <= false_alarm < 1.0,
         f"at most {_MOST_CELLS} cells": world.num_cells <= _MOST_CELLS,
         "whole episodes, and a safe action that always locates": world.max_steps is None
         and world.safe,

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from trackmdp.arrays.numbers import REAL
 from trackmdp.arrays.types import Array
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.compose import compose, default, given
@@ -87,9 +88,7 @@ def frontier(
         >>> found.certified, found.corners[0].sensors, round(found.corners[-1].accuracy, 6)
         (True, 0.0, 1.0)
     """
-    if near is not None and not (
-        isinstance(near, int | float | np.number) and near >= 0
-    ):  # nor nan
+    if near is not None and not (isinstance(near, REAL) and near >= 0):  # nor nan
         raise UserError(f"near={near}: expected a number of sensors >= 0")
     own = {f"solver.{name}": value for name, value in options.items()}
     named = {"solver": solver, "solver.nodes": nodes, "solver.time_limit": time_limit}

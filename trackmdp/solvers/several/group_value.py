@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from trackmdp.arrays.entries import among
+from trackmdp.arrays.numbers import REAL
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.seeding import derive
@@ -43,7 +44,7 @@ def evaluate_group(
     Raises:
         UserError: `width` is no number > 0.
     """
-    if not isinstance(width, int | float) or not 0 < width < math.inf:
+    if not isinstance(width, REAL) or not 0 < width < math.inf:
         raise UserError(f"width={width}: expected a number > 0")
     group = rule.group
     if group.recorded is not None:
