@@ -21,7 +21,6 @@ from trackmdp.errors import UserError
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
-
 LONG = "a" * 300  # longer than a name may be
 
 

@@ -25,7 +25,6 @@ from trackmdp.training.group_run import learned_policy
 
 WORLD = small_world(t_max=2)
 
-
 M, CHOICES = WORLD.num_cells, WORLD.num_choices
 
 

@@ -30,7 +30,6 @@ class Signs(torch.distributions.HalfNormal):
 
 SHARED = torch.Generator().manual_seed(0)
 
-
 DRAWING: dict[str, Any] = {
     "torch": lambda x, n, h: torch.rand(len(x), M) < 0.5,
     "torch, seldom": lambda x, n, h: torch.rand(len(x), M) < 1e-9,

@@ -13,9 +13,7 @@ import trackmdp as tm
 from tests.recordings.test_positions import read
 from tests.tracks import digest_of
 from trackmdp.errors import UserError
-from trackmdp.recordings.positions import (
-    frame_positions,
-)
+from trackmdp.recordings.positions import frame_positions
 
 OPTIONS: dict[str, Any] = {"size": (4, 4), "cell": 10.0, "step": 1.0, "min_length": 1}
 

@@ -24,7 +24,6 @@ from trackmdp.recordings.track_files import read_positions
 
 NOON = 1714564800.0  # 2024-05-01T12:00:00Z
 
-
 GPX = """<?xml version="1.0"?><gpx version="1.1" creator="t" xmlns="http://www.topografix.com/GPX/1/1">
 <trk><name>a</name><trkseg>
 <trkpt lat="47.5" lon="8.5"><time>2024-05-01T12:00:00Z</time></trkpt>
@@ -33,7 +32,6 @@ GPX = """<?xml version="1.0"?><gpx version="1.1" creator="t" xmlns="http://www.t
 <trk><trkseg><trkpt lat="47.7" lon="8.7"></trkpt>
 <trkpt lat="47.7" lon="8.8"><time>2024-05-01T14:00:00+02:00</time></trkpt></trkseg></trk></gpx>"""
 
-
 LINES = """{"type": "FeatureCollection", "features": [
 {"type": "Feature", "geometry": {"type": "LineString", "coordinates": [[8.5, 47.5, 400], [8.5, 47.6]]},
  "properties": {"coordTimes": ["2024-05-01T12:00:00Z", "2024-05-01T12:00:05Z"]}},
@@ -41,17 +39,14 @@ LINES = """{"type": "FeatureCollection", "features": [
  "properties": {"coordinateProperties": {"times": [["2024-05-01T12:00:00Z"], ["2024-05-01T12:00:01Z"]]}}},
 {"type": "Feature", "geometry": null, "properties": null}]}"""
 
-
 POINTS = """{"type": "FeatureCollection", "features": [
 {"type": "Feature", "geometry": {"type": "Point", "coordinates": [8.5, 47.5]}, "properties": {"MMSI": 3, "time": 5}},
 {"type": "Feature", "geometry": {"type": "Point", "coordinates": [8.4, 47.5]}, "properties": {"MMSI": 3, "time": 4}}
 ]}"""
 
-
 SUMO = """<fcd-export><timestep time="0.00"><vehicle id="b" x="1.5" y="2.5" speed="3"/></timestep>
 <timestep time="5.00"><vehicle id="b" x="3" y="4"/><vehicle id="a" x="0" y="0"/><person id="p" x="9" y="8"/></timestep>
 </fcd-export>"""
-
 
 MOT = "1,2,100,50,20,60,1,1,1\n2,2,110,50,20,60,1\n1,1,0,0,10,10,1,1,1\n2,1,0,0,10,10,0,1,1\n3,-1,0,0,10,10,1,1,1\n"
 
@@ -63,7 +58,6 @@ AIS = """# Timestamp,Type of mobile,MMSI,Latitude,Longitude,SOG
 01/05/2024 12:00:20,Class A,219000001,91,181,1
 01/05/2024 12:00:20,Class A,219000001,,,1
 """
-
 
 ADSB = """time,icao24,lat,lon,track,callsign
 1714564805,4b1803,47.6,8.5,90,SWR
@@ -172,7 +166,6 @@ def test_sumo(tmp_path: Path) -> None:
 
 
 BOMB = '<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;&a;">]>'
-
 
 DAMAGED = {
     "no columns": ("points", "a,b\n1,2\n", "columns a, b: expected id (mmsi, icao24,"),

@@ -13,6 +13,7 @@ import numpy as np
 from tests.helpers import train_config
 from trackmdp.config import PaperCostConfig, TrainConfig
 from trackmdp.config.tree import config_digest, config_text
+from trackmdp.durable import write_json
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers import rules
 from trackmdp.solvers.evaluation import figures
@@ -98,3 +99,10 @@ def write_sweep(folder: Path) -> Path:
                     wrong=wrong + seed,
                 )
     return folder
+
+
+def plan(folder: Path, *names: object) -> None:
+    """Write the plan of a sweep with these runs."""
+    jobs = [{"folder": name, "overrides": []} for name in names]
+    line = "trackmdp train -m 'hydra.sweep.dir=/x y'"
+    write_json(folder / "sweep.json", {"command": "train", "line": line, "jobs": jobs})

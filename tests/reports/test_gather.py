@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from tests.reports.sweeps import VERSIONS, write_curve, write_run, write_sweep
+from tests.reports.sweeps import VERSIONS, plan, write_curve, write_run
 from trackmdp.config import load_run_config
 from trackmdp.durable import write_json, write_sealed
 from trackmdp.errors import UserError
@@ -37,24 +37,8 @@ from trackmdp.world.make import build_world
 Change = Callable[[Path], Any]
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_sweep(tmp_path_factory.mktemp("sweep"))
-
-
-@pytest.fixture
-def sweep(whole: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(whole, tmp_path / "sweep"))
-
-
 def reasons(found: Results) -> dict[str, str]:
     return {anomaly.run: anomaly.text for anomaly in found.anomalies}
-
-
-def plan(folder: Path, *names: object) -> None:
-    jobs = [{"folder": name, "overrides": []} for name in names]
-    line = "trackmdp train -m 'hydra.sweep.dir=/x y'"
-    write_json(folder / "sweep.json", {"command": "train", "line": line, "jobs": jobs})
 
 
 def sealed_again(run: Path) -> None:

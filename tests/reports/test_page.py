@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.episodes.browser import CHROMIUM, Browser
-from tests.reports.sweeps import write_run, write_sweep
-from tests.reports.test_gather import plan
+from tests.reports.sweeps import plan, write_run
 from tests.tracks import by_hand, recorded
 from trackmdp.config.compose import compose
 from trackmdp.paper.calibration import Openings, candidates, checks, sensitivity
@@ -276,8 +275,7 @@ def test_without_a_solver_a_bound_counts_as_attained_only_where_a_learned_policy
     assert f'data-v="{best!r}"' in text
 
 
-def test_runs_of_an_earlier_line_count_as_planned_but_copies_do_not(tmp_path: Path) -> None:
-    sweep = write_sweep(tmp_path / "sweep")
+def test_runs_of_an_earlier_line_count_as_planned_but_copies_do_not(sweep: Path) -> None:
     shutil.copytree(sweep / "a2c-0.22-0", sweep / "z")
     names = sorted(path.name for path in sweep.iterdir())
     plan(sweep, *names[:2], "ppo-0.16-0")  # the second line, in the folder of the first

@@ -2,27 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from tests.reports.sweeps import write_sweep
-from tests.reports.test_gather import plan
+from tests.reports.sweeps import plan
 from trackmdp.errors import UserError
 from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.results import RESULTS, load_results, save_results
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_sweep(tmp_path_factory.mktemp("sweep"))
-
-
-@pytest.fixture
-def sweep(whole: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(whole, tmp_path / "sweep"))
 
 
 def test_stored_results_read_back_the_same_and_are_small(whole: Path, tmp_path: Path) -> None:

@@ -17,14 +17,6 @@ from trackmdp.training.state import take_weights
 from trackmdp.world.make import build_world
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run with three checkpoints."""
-    folder = tmp_path_factory.mktemp("state") / "whole"
-    train(folder, "checkpoint.keep=3")
-    return folder
-
-
 def test_weights_are_taken_where_they_fit(
     whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

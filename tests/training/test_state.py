@@ -27,14 +27,6 @@ from trackmdp.world.problem_file import PROBLEM, problem_bytes, read_problem
 CPU = torch.device("cpu")
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run with three checkpoints."""
-    folder = tmp_path_factory.mktemp("state") / "whole"
-    train(folder, "checkpoint.keep=3")
-    return folder
-
-
 def breaks() -> None:
     raise OSError(5, "Input/output error")
 
