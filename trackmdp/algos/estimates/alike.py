@@ -9,7 +9,6 @@ from trackmdp.arrays.entries import per_row, row_index, with_data
 from trackmdp.arrays.files import read_numbers
 from trackmdp.arrays.types import BoolArray, IndexArray
 from trackmdp.errors import UserError
-from trackmdp.grid.displacements import displacement
 
 DEVIATIONS = 4.0
 """Standard deviations by which a test of homogeneity has to be exceeded for a group of cells to be split up."""
@@ -105,22 +104,15 @@ class AlikeCells:
     def pooled(self, counts: sparse.csr_array) -> sparse.csr_array:
         """`[M, M + 1]` counts of moves, each cell's being those of its whole group; the last column is the exit."""
         m, (start, end) = len(self.groups), (row_index(counts), counts.indices)
-        # On 10 columns, 2 rows down and 1 column to the left is the shift 2 · 20 - 1 = 39, read back as row
-        # (39 + 10) // 20 = 2 and column 39 - 40 = -1. The exit has a number of its own, beyond all of these.
-        wide, exit_shift = 2 * self.columns, 4 * m + 1
-        down, across = displacement(self.columns, start, end)
-        shift = down * wide + across
-        shifts, place = np.unique(np.where(end == m, exit_shift, shift), return_inverse=True)
+        # Within a group a difference of cell numbers is one displacement: across a row either the column is the same
+        # for all, or both borders are farther away than any move. The exit has a number beyond all differences.
+        shifts, place = np.unique(np.where(end == m, m, end - start), return_inverse=True)
         shape = (len(self.first), len(shifts))
-        each = sparse.csr_array((counts.data, (self.groups[start], place)), shape=shape)[
-            self.groups
-        ]
+        each = sparse.csr_array((counts.data, (self.groups[start], place)), shape=shape)
+        each = each[self.groups]
         start, shift = row_index(each), shifts[each.indices]
-        down = (shift + self.columns) // wide
-        end = start + down * self.columns + (shift - down * wide)
-        return sparse.csr_array(
-            (each.data, (start, np.where(shift == exit_shift, m, end))), shape=counts.shape
-        )
+        end = np.where(shift == m, m, start + shift)
+        return sparse.csr_array((each.data, (start, end)), shape=counts.shape)
 
     def spread(self, kernel: sparse.csr_array) -> sparse.csr_array:
         """`[M, M + 1]` with the row of the first cell of each group, moved to all the others'."""

@@ -72,21 +72,17 @@ def each_once(paths: ObservedPaths) -> tuple[ObservedPaths, Array]:
 
     Sets are compared by two sums of 64 random bits per (miss, cell): unequal ones agree with probability 2^-128.
     """
-    choices, m = paths.choices, paths.sensed.shape[1]
+    choices, m, count = paths.choices, paths.sensed.shape[1], len(paths.start)
     # Row k * (t_max + 1) + t belongs to miss t of path k; rows of t >= n were never used, and must not make paths
     # differ.
     path, miss = np.divmod(row_index(paths.sensed), choices)
-    read = miss < paths.misses[path]
+    bits = np.where(miss < paths.misses[path], paths.sensed.data.view(np.uint64) | 1, 0)
     marks = np.random.default_rng(0).integers(2**63, size=(2, choices * m), dtype=np.uint64)
-    # path k's sum is over its own entries, in any order: equal sets have equal sums
-    sums = np.zeros((2, len(paths.start)), dtype=np.uint64)
-    entry, bits = (miss * m + paths.sensed.indices)[read], paths.sensed.data[read].view(np.uint64)
-    for mark, total in zip(marks, sums, strict=True):  # unsigned sums and products wrap around
-        np.add.at(total, path[read], mark[entry] * (bits | 1))
-    keys = np.stack(
-        [*(part.astype(np.uint64) for part in (paths.start, paths.misses, paths.end)), *sums],
-        axis=1,
-    )
+    place = (path, miss * m + paths.sensed.indices)
+    # Unsigned sums and products wrap around: equal sets have equal sums, in any order.
+    sums = sparse.csr_array((bits, place), shape=(count, choices * m)) @ marks.T
+    known = np.stack([paths.start, paths.misses, paths.end], axis=1).astype(np.uint64)
+    keys = np.concatenate([known, sums], axis=1)
     _, first, copies = np.unique(keys, axis=0, return_index=True, return_counts=True)
     return paths.pick(first), copies.astype(np.float64)
 
@@ -99,8 +95,9 @@ def expected_moves(
     With f_t the undetected mass and l_t the likelihood of the later observations, the move i -> j at step t of
     a path is made with probability f_t(i) P_ij l_{t+1}(j) / (likelihood of the path); P_ij is multiplied in at the end.
     """
-    m, made = kernel.shape[0], _OnEntries(kernel)
-    moves, backward, leave = _directions(kernel)
+    m, moves, backward, leave = kernel.shape[0], *_directions(kernel)
+    # Sums at the stored entries of the kernel alone: all other moves have probability 0.
+    possible, made = _support(kernel), sparse.csr_array(kernel.shape)
     for n, ends, part in _parts(moves, paths, paths.end <= m):
         some, each = paths.pick(part), np.arange(len(part))
         sensed = some.sets(n)
@@ -110,46 +107,23 @@ def expected_moves(
         weight = copies[part] / np.maximum(forward[n].multiply(later).sum(axis=1), 1e-300)
         if ends:
             # The last move ends in the known cell, or in the exit, column M: f_n(i) at (i, end), weighted.
-            made.add(forward[n], counted(each, some.end, weight, (len(part), m + 1)))
+            last = counted(each, some.end, weight, (len(part), m + 1))
+            made = made + _pairs(forward[n], last, possible)
         for t in range(n - 1, -1, -1):
             later = _hidden(later, sensed[t])
-            made.add(forward[t], sparse.diags_array(weight) @ later)
+            made = made + _pairs(forward[t], sparse.diags_array(weight) @ later, possible)
             # l_t(i) = sum_j P_ij l_{t+1}(j), with l zero where the cell was sensed: there it would have been detected.
             later = (later @ moves.T).multiply(_support(forward[t]))
-    return made.matrix()
+    return made.multiply(kernel)
 
 
-class _OnEntries:
-    """Sums over paths at the stored entries of a kernel `[M, M + 1]` alone: all other moves have probability 0."""
-
-    def __init__(self, kernel: sparse.csr_array) -> None:
-        self._kernel = kernel if kernel.has_sorted_indices else kernel.sorted_indices()
-        self._sums = np.zeros(kernel.nnz)
-
-    def add(self, before: sparse.csr_array, after: sparse.csr_array) -> None:
-        """Add at (i, j) the sum over the paths k of before(k, i) after(k, j): `[K, M]` and `[K, M]` or `[K, M + 1]`."""
-        pairs = sparse.csr_array(before.T) @ after
-        rows = np.flatnonzero(np.diff(pairs.indptr))
-        # The entries of these rows of the kernel, and their numbers.
-        some, count = self._kernel[rows], np.diff(self._kernel.indptr)[rows]
-        entry = np.repeat(self._kernel.indptr[rows] - some.indptr[:-1], count) + np.arange(some.nnz)
-        pairs = pairs[rows]
-        pairs.resize(some.shape)
-        some.data[:] = 1.0
-        found = pairs.multiply(some)
-        width = some.shape[1]
-        place = np.searchsorted(
-            row_index(some) * width + some.indices, row_index(found) * width + found.indices
-        )
-        self._sums[entry[place]] += found.data
-
-    def matrix(self) -> sparse.csr_array:
-        """`[M, M + 1]` the sums times the kernel."""
-        kernel = self._kernel
-        parts = (self._sums * kernel.data, kernel.indices, kernel.indptr)
-        total = sparse.csr_array(parts, shape=kernel.shape, copy=True)
-        total.eliminate_zeros()
-        return total
+def _pairs(
+    before: sparse.csr_array, after: sparse.csr_array, possible: sparse.csr_array
+) -> sparse.csr_array:
+    """At the `possible` (i, j) the sum over the paths k of before(k, i) after(k, j); `[M, M + 1]`."""
+    pairs = sparse.csr_array(before.T) @ after
+    pairs.resize(possible.shape)
+    return pairs.multiply(possible)
 
 
 def _directions(kernel: sparse.csr_array) -> tuple[sparse.csr_array, sparse.csr_array, Array]:
