@@ -66,7 +66,7 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         ),
         ("train seed=0,1", "seed=0,1: expected one value; add -m"),
         ("train algo=[a2c,ppo]", "algo=[a2c,ppo]: expected one choice, not a list"),
-        ("train -m seed=range(10000000)", "seed=range(10000000): expected at most 100,000 values"),
+        ("train -m seed=range(10000000)", "seed=range(10000000): expected 1 to 100,000 values"),
         (
             "train -m seed=range(1000) kernel.seed=range(1000)",
             "a sweep of 1,000,000 runs: expected at most 100,000",

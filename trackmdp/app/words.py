@@ -6,16 +6,20 @@ import itertools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 
-from trackmdp.config import GROUPS, ROOTS, Option, options
+from trackmdp.config import GROUPS, ROOTS, CommandConfig, Option, options
 from trackmdp.config.checks import check_choice, check_option
 from trackmdp.config.compose import composed_values, known_options
-from trackmdp.config.options import listed, refuse, several
+from trackmdp.config.options import refuse, several
 from trackmdp.errors import UserError
+
+MOST = 100_000
+"""Runs of a sweep, and values of a word; range(10000000) is a slip."""
 
 Compose = Callable[[Sequence[str]], DictConfig]
 
@@ -62,6 +66,31 @@ def values_of(override: Override) -> list[Any]:
         raise UserError(f"{override.input_line}: {error}") from error
 
 
+def single_words(override: Override) -> list[str]:
+    """The words of the single values of a word.
+
+    Raises:
+        UserError: they cannot be counted, or are none or too many.
+    """
+    key = override.get_key_element()
+    if override.is_delete():
+        return [str(override.input_line)]
+    if not override.is_sweep_override():
+        return [f"{key}={override.get_value_element_as_str()}"]
+    if not override.is_discrete_sweep():
+        raise UserError(
+            f"{override.input_line}: expected values that can be counted; hydra/sweeper=optuna searches"
+        )
+    try:
+        found = itertools.islice(override.sweep_string_iterator(), MOST + 1)
+        values = [f"{key}={value}" for value in found]
+    except ValueError as error:  # range(0,1,0)
+        raise UserError(f"{override.input_line}: {error}") from error
+    if not 1 <= len(values) <= MOST:  # range(3,0) has none
+        raise UserError(f"{override.input_line}: expected 1 to {MOST:,} values")
+    return values
+
+
 def run_words(words: Iterable[str]) -> list[str]:
     """The overrides of the command's own config, without those of Hydra (`hydra.x=...`, `hydra/x=...`)."""
     return [word for word in words if not word.lstrip("+~").startswith(("hydra.", "hydra/"))]
@@ -93,81 +122,64 @@ def _refuse_wrong(error: Exception, command: str, words: Sequence[str], compose:
     Raises:
         UserError: there is one.
     """
-    overrides = [parsed(word) for word in words]
+    root, overrides = ROOTS[command], [parsed(word) for word in words]
     for override in overrides:
-        values_of(override)  # refused here where they cannot be listed
-    # Hydra's message is that a sweep "requires --multirun"; nothing is wrong with the value itself.
-    sweeps = [override.input_line for override in overrides if override.is_sweep_override()]
-    if sweeps and ("multirun" in str(error).lower()):
-        group, _, names = str(sweeps[0]).partition("=")
-        if several(ROOTS[command], group) and "[" not in names:
-            raise UserError(f"{sweeps[0]}: expected {group}=[{names}]")
-        raise UserError(f"{sweeps[0]}: expected one value; add -m to run once for each")
-    for override in overrides:
-        key, value = override.key_or_group, override.value()
-        if override.is_add() and isinstance(value, str) and "Multiple values" in str(error):
-            raise UserError(f"{override.input_line}: in the config already, expected {key}={value}")
-    _check_groups(overrides, command)
-    # An experiment, a launcher or a sweeper: exactly one, by the name of a file.
-    named = ("hydra/", "experiment") if command == "train" else "hydra/"
-    files = [override for override in overrides if override.key_or_group.startswith(named)]
-    of_command = GROUPS.keys() & options(ROOTS[command])
-    groups = [override for override in overrides if override.key_or_group in of_command]
+        _check_form(override, command, str(error))
+    # An experiment, a launcher or a sweeper is chosen as well, by the name of a file.
+    groups = GROUPS.keys() & options(root) | ({"experiment"} if command == "train" else set())
+    keys = {each.key_or_group for each in overrides}
+    groups |= {key for key in keys if key.startswith("hydra/")}
+    chosen = [override for override in overrides if override.key_or_group in groups]
     # Choices before values: with algo=pppo every algo.* would be unknown, though only the choice is wrong.
-    for override in files:
-        _check_file(override, str(error))
-    for override in groups:
-        _check_choice(override, command, str(error))
+    for override in chosen:
+        _check_choice(override, root)
     # The options depend on the choices: in algo=a2c,ppo algo.epochs is an option of one of them. The first
     # combination that composes and shows a mistake decides.
-    for choices in itertools.product(*map(_single_words, [*files, *groups])):
+    for choices in itertools.product(*map(single_words, chosen)):
         try:
-            values = composed_values(compose(choices), ROOTS[command])
-            known = known_options(values, ROOTS[command])
+            known = known_options(composed_values(compose(choices), root), root)
         except (
             Exception
         ):  # the choices themselves are at fault; at the end Hydra's own message is reported
             continue
         for override in overrides:
-            if override not in [*files, *groups]:
+            if override not in chosen:
                 _check_value(override, known)
 
 
-def _check_groups(overrides: Sequence[Override], command: str) -> None:
-    """Refuse a word of a group that the command does not have, before the choice that it belongs to is asked for."""
-    of_others = GROUPS.keys() - options(ROOTS[command])
-    for override in overrides:
-        group = override.key_or_group.partition(".")[0]
-        if group in of_others and not group.startswith("hydra/"):  # which all commands have
-            raise UserError(f"{override.input_line}: {command} has no {group}")
+def _check_form(override: Override, command: str, message: str) -> None:
+    """Refuse several values for one run, by Hydra's message, an addition of what is there, or another's group."""
+    word, key, value = override.input_line, override.key_or_group, override.value()
+    single_words(override)  # refused here where they cannot be listed
+    # Hydra's message is that a sweep "requires --multirun"; nothing is wrong with the value itself.
+    if override.is_sweep_override() and "multirun" in message.lower():
+        _, _, names = str(word).partition("=")
+        if several(ROOTS[command], key) and "[" not in names:
+            raise UserError(f"{word}: expected {key}=[{names}]")
+        raise UserError(f"{word}: expected one value; add -m to run once for each")
+    if override.is_add() and isinstance(value, str) and "Multiple values" in message:
+        raise UserError(f"{word}: in the config already, expected {key}={value}")
+    group = key.partition(".")[0]
+    # Those of Hydra all commands have.
+    if group in GROUPS.keys() - options(ROOTS[command]) and not group.startswith("hydra/"):
+        raise UserError(f"{word}: {command} has no {group}")
 
 
-def _check_choice(override: Override, command: str, message: str) -> None:
-    """Refuse a list where one choice is expected, or a choice that Hydra did not find, by its message `message`."""
+def _check_choice(override: Override, root: type[CommandConfig]) -> None:
+    """Refuse a choice that does not exist, or a list where one is expected."""
     group = override.key_or_group
-    if isinstance(override.value(), list) and not several(ROOTS[command], group):
-        raise UserError(f"{override.input_line}: expected one choice, not a list")
-    for value in _names(override):
-        # Hydra has `find` for a single choice and `load` of one in a list.
-        missing = any(f"Could not {verb} '{group}/{value}" in message for verb in ("find", "load"))
-        if missing or not isinstance(value, str):
-            check_choice(group, value)
-
-
-def _check_file(override: Override, message: str) -> None:
-    """Refuse a choice that does not exist, by its message `message`, or several where one is expected."""
-    key, values = override.key_or_group, values_of(override)
-    if len(values) > 1:
-        raise UserError(f"{override.input_line}: expected one {key.split('/')[-1]}")
-    if f"Could not find '{key}/{values[0]}'" in message:
-        # Hydra ends its message with one option a line, each after a tab. Schemas are stored as `base_...`, and are no
-        # choices.
-        tail = message.partition(f"Available options in '{key}':")[2].splitlines()[1:]
-        names = [
-            line.strip() for line in itertools.takewhile(lambda line: line.startswith("\t"), tail)
-        ]
-        known = [name for name in names if not name.startswith("base_")]
-        raise refuse(key, values[0], f"one of {', '.join(known) or 'none, since there is none'}")
+    files = GlobalHydra.instance().config_loader().get_group_options(group)
+    for value in values_of(override):
+        if isinstance(value, list) and not several(root, group):
+            raise UserError(f"{override.input_line}: expected one choice, not a list")
+        for name in value if isinstance(value, list) else [value]:
+            if name in files:
+                continue
+            if group in options(root):
+                check_choice(group, name)
+            # Schemas are stored as `base_...`, and are no choices.
+            known = [each for each in files if not each.startswith("base_")]
+            raise refuse(group, name, f"one of {', '.join(known) or 'none, since there is none'}")
 
 
 def _check_value(override: Override, known: dict[str, Option]) -> None:
@@ -185,21 +197,6 @@ def _check_value(override: Override, known: dict[str, Option]) -> None:
         raise UserError(f"{override.input_line}: expected {key}=value, without + or ~")
     for value in values_of(override):
         check_option(key, value, known)
-
-
-def _single_words(override: Override) -> list[str]:
-    """A word for each of the choices that a word makes."""
-    values = [listed(value) if isinstance(value, list) else value for value in values_of(override)]
-    return [f"{override.key_or_group}={value}" for value in values]
-
-
-def _names(override: Override) -> list[Any]:
-    """The choices that a word makes; a list of a group of several is taken apart."""
-    return [
-        name
-        for value in values_of(override)
-        for name in (value if isinstance(value, list) else [value])
-    ]
 
 
 def _plain(error: Exception) -> str:

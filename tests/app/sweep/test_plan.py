@@ -68,7 +68,7 @@ def test_a_value_with_commas_in_quotes_or_brackets_is_one_value() -> None:
         (["seed=1 algo"], [], "algo: expected option=value"),
         ([], ["seed=interval(0,3)"], r"seed=interval\(0,3\): expected values that can be counted"),
         ([], ["experiment=a,b"], "experiment=a,b: expected one experiment"),
-        ([], ["seed=range(3,0)"], r"seed=range\(3,0\): no value"),
+        ([], ["seed=range(3,0)"], r"seed=range\(3,0\): expected 1 to 100,000 values"),
     ],
 )
 def test_words_that_make_no_grid(blocks: list[str], words: list[str], message: str) -> None:

@@ -13,12 +13,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hydra.core.override_parser.types import Override
 from rich.console import Console
 from rich.progress import track
 
 from trackmdp.app.sweep.configs import Configs
-from trackmdp.app.words import Compose, parsed
+from trackmdp.app.words import MOST, Compose, parsed, single_words
 from trackmdp.config import CommandConfig, TrainConfig, to_dict
 from trackmdp.config.resume import fixed_options, key_of
 from trackmdp.config.sweeping import BlocksConfig
@@ -27,9 +26,6 @@ from trackmdp.errors import UserError
 _T = TypeVar("_T")
 _MANY = 100
 """Runs from which on progress is shown."""
-
-MOST = 100_000
-"""Runs of a sweep, and values of a word; range(10000000) is a slip."""
 
 _UNNAMED = ("experiment", "quiet", "resume")
 """Keys that are left out of a folder's readable name: they do not change a result, or stand for other words."""
@@ -114,7 +110,7 @@ def combinations(blocks: Sequence[str], typed: Sequence[str]) -> list[list[str]]
                 raise UserError(f"{word}: expected one experiment; each is a sweep of its own")
             # By key: typed words come last, and replaces the word of the block. `algo=a2c,ppo seed=0,1` makes the
             # axes {algo: [algo=a2c, algo=ppo], seed: [seed=0, seed=1]}.
-            axes[override.key_or_group] = _values(override)
+            axes[override.key_or_group] = single_words(override)
         # Counted before they are listed: the list might fill the memory.
         if (runs := math.prod(map(len, axes.values()))) > MOST:
             raise UserError(f"a sweep of {runs:,} runs: expected at most {MOST:,}")
@@ -248,28 +244,3 @@ def _resumable(cfg: CommandConfig) -> CommandConfig:
             f"resume={cfg.resume}: expected null or auto in a sweep: its runs go on in their own folders"
         )
     return replace(cfg, resume="auto")
-
-
-def _values(override: Override) -> list[str]:
-    """The words of the single values of a word."""
-    key = override.get_key_element()
-    if override.is_delete():
-        return [str(override.input_line)]
-    if not override.is_sweep_override():
-        return [f"{key}={override.get_value_element_as_str()}"]
-    if not override.is_discrete_sweep():
-        raise UserError(
-            f"{override.input_line}: expected values that can be counted; hydra/sweeper=optuna searches"
-        )
-    try:
-        values = [
-            f"{key}={value}"
-            for value in itertools.islice(override.sweep_string_iterator(), MOST + 1)
-        ]
-    except ValueError as error:  # range(0,1,0)
-        raise UserError(f"{override.input_line}: {error}") from error
-    if not values:  # range(3,0)
-        raise UserError(f"{override.input_line}: no value, expected at least one")
-    if len(values) > MOST:
-        raise UserError(f"{override.input_line}: expected at most {MOST:,} values")
-    return values

@@ -7,17 +7,23 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import optuna
 from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
+from optuna.distributions import (
+    BaseDistribution,
+    CategoricalDistribution,
+    FloatDistribution,
+    IntDistribution,
+)
 from optuna.exceptions import ExperimentalWarning
 from optuna.samplers import RandomSampler, TPESampler
-from optuna.trial import TrialState
+from optuna.trial import BaseTrial, FrozenTrial, TrialState
 
-from trackmdp.app.sweep.plan import MOST, Job, MakeJobs
+from trackmdp.app.sweep.plan import Job, MakeJobs
 from trackmdp.app.sweep.sweep import run_figures
-from trackmdp.app.words import parsed
+from trackmdp.app.words import parsed, single_words, values_of
 from trackmdp.config.sweeping import OptunaConfig
 from trackmdp.errors import UserError
 from trackmdp.seeding import derive
@@ -27,7 +33,7 @@ from trackmdp.untrusted import reason
 STUDY = "study.db"
 """File in the sweep's folder that holds the study, where no other storage is named."""
 
-_WORDS = "words"
+_OTHER = "hydra.sweeper.storage: the study is one of another search"
 _DIRECTIONS = {"aihtr": "maximize", "regret_per_step": "minimize"}
 
 
@@ -47,17 +53,15 @@ def trials(
     """
     searched, fixed = _searched(cfg, words)
 
-    def job_of(chosen: Sequence[str]) -> Job:
+    def job_of(trial: BaseTrial) -> Job:
+        # In the order of the line: a storage gives a trial's values in any.
+        if trial.params.keys() != searched.keys():
+            raise UserError(f"{_OTHER} ({', '.join(trial.params)})")
+        chosen = [f"{key}={trial.params[key]}" for key in searched]
         return planned([[*fixed, *chosen]], searched)[0]
 
     with _study(cfg, folder) as study:
-        # The words are kept with each trial: Optuna's own parameters would have to be put into Hydra's notation again.
-        known = [
-            trial.user_attrs.get(_WORDS, [])
-            for trial in study.trials
-            if trial.state == TrialState.COMPLETE
-        ]
-        earlier = [job_of(chosen) for chosen in known]
+        earlier = [job_of(trial) for trial in _completed(study)]
         # Handed over as a batch of its own: the sweep finds them done, and they stand in its table.
         if here := [job for job in earlier if run_of(job.folder).state == "done"]:
             yield here
@@ -66,27 +70,29 @@ def trials(
         failed = 0
         # `n_trials` is the whole study's, so that a call that was interrupted and is repeated comes to the same
         # number; Optuna's own `optimize` would add so many each time.
-        while missing := max(0, cfg.n_trials - _completed(study) - failed):
+        while missing := max(0, cfg.n_trials - len(_completed(study)) - failed):
             asked = [_ask(cfg, study, searched, place) for place in range(min(cfg.batch, missing))]
-            jobs = [job_of(chosen) for _, chosen in asked]
+            jobs = [job_of(trial) for trial in asked]
             # A sampler may propose the same values twice within a batch: one run, with its result for both trials.
             yield list({job.name: job for job in jobs}.values())
             # The generator goes on only when the sweep asks for the next batch, after all runs of this one are over.
-            for (trial, _), job in zip(asked, jobs, strict=True):
+            for trial, job in zip(asked, jobs, strict=True):
                 failed += _tell(cfg, study, trial, job)
 
 
-def _searched(cfg: OptunaConfig, words: Sequence[str]) -> tuple[dict[str, Override], list[str]]:
-    """Option -> its word, of the words that are searched; and the words that all trials have."""
+def _searched(
+    cfg: OptunaConfig, words: Sequence[str]
+) -> tuple[dict[str, BaseDistribution], list[str]]:
+    """Option -> its values, of the words that are searched; and the words that all trials have."""
     read = [parsed(word) for word in words]
-    searched = {each.get_key_element(): each for each in read if each.is_sweep_override()}
+    searched = {
+        each.get_key_element(): _distribution(each) for each in read if each.is_sweep_override()
+    }
     fixed = [word for word, each in zip(words, read, strict=True) if not each.is_sweep_override()]
     if not searched:
         raise UserError(
             "hydra/sweeper=optuna: expected a word to search, such as algo.gamma=interval(0.9,0.99)"
         )
-    for key, each in searched.items():
-        _check(key, each.value())
     timed = [each.value() for each in read if each.get_key_element() == "optimal.time_limit"]
     if cfg.objective == "regret_per_step" and any(value is not None for value in timed):
         raise UserError(
@@ -95,22 +101,45 @@ def _searched(cfg: OptunaConfig, words: Sequence[str]) -> tuple[dict[str, Overri
     return searched, fixed
 
 
+def _distribution(override: Override) -> BaseDistribution:
+    """The values of a word that is searched, in the notation of Hydra's sweeps.
+
+    Raises:
+        UserError: there are none between its bounds, or too many.
+    """
+    value: Any = override.value()
+    if isinstance(value, IntervalSweep):
+        ends: Any = value.start, value.end  # never None by Hydra's grammar, possibly by its types
+        (low, high), log = ends, "log" in value.tags
+        if not (0 if log else -math.inf) < low < high < math.inf:
+            raise UserError(
+                f"{override.input_line}: expected interval(a,b) with {'0 < ' if log else ''}a < b"
+            )
+        # Hydra gives interval(1,8) bounds that are floats; int(interval(1,8)) has whole ones, and is searched in whole
+        # numbers.
+        return (IntDistribution if isinstance(low, int) else FloatDistribution)(low, high, log)
+    words = single_words(override)
+    if isinstance(value, RangeSweep):
+        # A range may fall, range(8,0,-2); Optuna wants low to high.
+        values = sorted(values_of(override))
+        kind: Any = IntDistribution if isinstance(values[0], int) else FloatDistribution
+        return cast(BaseDistribution, kind(values[0], values[-1], step=abs(value.step)))
+    # As strings in Hydra's notation, since they become words: null, [1,2] and quoted text stay as they are.
+    return CategoricalDistribution([word.partition("=")[2] for word in words])
+
+
 def _ask(
-    cfg: OptunaConfig, study: Any, searched: dict[str, Override], place: int
-) -> tuple[Any, list[str]]:
-    """The next trial and its words. Draws depend on the seed and on the results known, not on interruptions."""
+    cfg: OptunaConfig, study: Any, searched: dict[str, BaseDistribution], place: int
+) -> BaseTrial:
+    """The next trial. Draws depend on the seed and on the results known, not on interruptions."""
     # A sampler's state is not kept in the storage. Seeded anew from the results, the choice after an interruption is
     # the one that would have come without it. 2^32: NumPy takes no larger seed.
-    study.sampler = _sampler(cfg, derive(cfg.seed, "optuna", _completed(study), place) % 2**32)
-    trial = study.ask()
+    seed = derive(cfg.seed, "optuna", len(_completed(study)), place) % 2**32
+    study.sampler = _sampler(cfg, seed)
     try:
-        words = [f"{key}={_suggest(trial, key, override)}" for key, override in searched.items()]
+        return cast(BaseTrial, study.ask(searched))
     except ValueError as error:
-        raise UserError(
-            f"hydra.sweeper.storage: the study is one of another search ({error})"
-        ) from error
-    trial.set_user_attr(_WORDS, words)
-    return trial, words
+        raise UserError(f"{_OTHER} ({error})") from error
 
 
 def _sampler(cfg: OptunaConfig, seed: int) -> Any:
@@ -118,46 +147,8 @@ def _sampler(cfg: OptunaConfig, seed: int) -> Any:
         return RandomSampler(seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ExperimentalWarning)
-        return TPESampler(
-            seed=seed, constant_liar=cfg.batch > 1
-        )  # else a batch would be the same run many times
-
-
-def _check(key: str, value: Any) -> None:
-    """Refuse bounds between which there is nothing to draw, or a range that is too long to be listed."""
-    if isinstance(value, IntervalSweep):
-        ends: Any = value.start, value.end  # never None by Hydra's grammar, possibly by its types
-        (low, high), log = ends, "log" in value.tags
-        if not (0 if log else -math.inf) < low < high < math.inf:
-            raise UserError(
-                f"{key}=interval({low},{high}): expected interval(a,b) with {'0 < ' if log else ''}a < b"
-            )
-    if isinstance(value, RangeSweep):
-        bounds: Any = value.start, value.stop, value.step
-        start, stop, step = bounds
-        span = stop - start if step > 0 else start - stop
-        if not 0 < span <= MOST * abs(step):
-            given = f"{key}=range({start},{stop},{step})"
-            raise UserError(f"{given}: expected range(a,b,step) of 1 to {MOST:,} values")
-
-
-def _suggest(trial: Any, key: str, override: Override) -> Any:
-    """A value for an option, in the notation of Hydra's sweeps."""
-    value = override.value()
-    if isinstance(value, IntervalSweep):
-        log = "log" in value.tags
-        # Hydra gives interval(1,8) bounds that are floats; int(interval(1,8)) has whole ones, and is searched in whole
-        # numbers.
-        draw = trial.suggest_int if isinstance(value.start, int) else trial.suggest_float
-        return draw(key, value.start, value.end, log=log)
-    if isinstance(value, RangeSweep):
-        steps: Any = override.sweep_iterator()
-        # A range may fall, range(8,0,-2); Optuna wants low to high.
-        values = sorted(steps)
-        draw = trial.suggest_int if isinstance(values[0], int) else trial.suggest_float
-        return draw(key, values[0], values[-1], step=abs(value.step))
-    # As strings in Hydra's notation, since they become words: null, [1,2] and quoted text stay as they are.
-    return trial.suggest_categorical(key, list(override.sweep_string_iterator()))
+        # Else a batch would be the same run many times.
+        return TPESampler(seed=seed, constant_liar=cfg.batch > 1)
 
 
 def _tell(cfg: OptunaConfig, study: Any, trial: Any, job: Job) -> int:
@@ -219,5 +210,5 @@ def _enqueue_interrupted(study: Any) -> None:
             known.append(trial.params)
 
 
-def _completed(study: Any) -> int:
-    return len(study.get_trials(deepcopy=False, states=[TrialState.COMPLETE]))
+def _completed(study: Any) -> list[FrozenTrial]:
+    return cast(list[FrozenTrial], study.get_trials(deepcopy=False, states=[TrialState.COMPLETE]))
