@@ -106,29 +106,28 @@ def reason(error: BaseException) -> str:
     return line[:200] or type(error).__name__
 
 
-def read_bytes(file: Path, *, most: int = SMALL, source: str = "", links: bool = False) -> bytes:
+def read_bytes(file: Path, *, most: int = SMALL, links: bool = False) -> bytes:
     """The content of an ordinary file; see `opened`.
 
     Raises:
         UserError: it cannot be read.
     """
-    source = source or str(file)
     with (
-        opened(file, most=most, source=source, links=links) as stream,
-        decoded(source, "a file that can be read"),
+        opened(file, most=most, links=links) as stream,
+        decoded(str(file), "a file that can be read"),
     ):
         # The present length: read(most) would allocate `most` bytes at once, and a file may be growing.
         return stream.read(os.fstat(stream.fileno()).st_size)
 
 
-def read_text(file: Path, *, most: int = SMALL, source: str = "", links: bool = False) -> str:
+def read_text(file: Path, *, most: int = SMALL, links: bool = False) -> str:
     """The content of an ordinary file of UTF-8 text, without a byte order mark.
 
     Raises:
         UserError: it cannot be read, or is no such text.
     """
-    content = read_bytes(file, most=most, source=source, links=links)
-    with decoded(source or str(file), "UTF-8 text"):
+    content = read_bytes(file, most=most, links=links)
+    with decoded(str(file), "UTF-8 text"):
         return content.decode("utf-8-sig")
 
 

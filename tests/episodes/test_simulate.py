@@ -24,7 +24,7 @@ from trackmdp.episodes.episode import Episode, first_difference
 from trackmdp.episodes.sentences import sentence
 from trackmdp.episodes.simulate import episode_seeds, resimulate, simulate
 from trackmdp.errors import UserError
-from trackmdp.policies import policy as policies
+from trackmdp.policies import lookup
 from trackmdp.policies.acting import Playback
 from trackmdp.policies.belief import BeliefFilter
 from trackmdp.policies.policy import Policy
@@ -195,7 +195,7 @@ def test_batches_and_ways_of_looking_up_change_nothing(
     monkeypatch.setattr("trackmdp.episodes.actors._MOST_ROWS", 7)
     monkeypatch.setattr("trackmdp.episodes.actors._DRAWS", 100)
     monkeypatch.setattr("trackmdp.episodes.batch._BELIEF", 50)
-    monkeypatch.setattr(policies, "_DENSE", 0)
+    monkeypatch.setattr(lookup, "DENSE", 0)
     acting = Policy(
         WORLD, ACTING[name].sets, probability=ACTING[name].probability, k=ACTING[name].k
     )

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule
 from tests.helpers import random_kernel
 from tests.policies.test_policy import M, stochastic
 from trackmdp.errors import UserError
-from trackmdp.policies import policy
+from trackmdp.policies import lookup
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.sensing.task import Task
 from trackmdp.world.model import World
@@ -45,11 +45,11 @@ def test_all_on_is_all_of_the_window() -> None:
     assert not Policy.none(world)(TensorDict(state, [2]))["action"].any()
 
 
-@pytest.mark.parametrize("dense_up_to", [0, policy._DENSE])
+@pytest.mark.parametrize("dense_up_to", [0, lookup.DENSE])
 def test_in_a_window_policies_act_and_are_asked_in_its_numbers(
     dense_up_to: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(policy, "_DENSE", dense_up_to)
+    monkeypatch.setattr(lookup, "DENSE", dense_up_to)
     monkeypatch.setattr("trackmdp.policies.unroll._HISTORY_AT_ONCE", 5 * 3 * 9)
     world = windowed()
     near = Policy.all_on(world).dense()

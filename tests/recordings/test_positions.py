@@ -200,7 +200,7 @@ DAMAGED = {
         "id,t,lat,lon\n1,0,147,-33\n1,1,147.1,-33\n",
         "(2 reports read; 2 reports without a time or a position; expected lat -90 to 90 and lon",
     ),
-    "json cut": ("geojson", '{"type": "FeatureCollection", "features": [', "not GeoJSON"),
+    "json cut": ("geojson", '{"type": "FeatureCollection", "features": [', "its content: not JSON"),
     "json other": ("geojson", "[1, 2]", "not GeoJSON with the times of its points ("),
     "json untimed": (
         "geojson",

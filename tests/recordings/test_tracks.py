@@ -74,9 +74,9 @@ def test_a_file_that_has_changed_is_read_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("track,step,cell\n4,0,1\n4,2,1\n", "track 4 has a gap: step 2 follows step 0"),
-        ("track,step,cell\n4,0,1\n5,0,2\n4,0,1\n", "track 4 has step 0 twice"),
-        ('track,step,cell\nv,0,1\n"u,0",0,2\n"u,0",0,1\n', "track u,0 has step 0 twice"),
+        ("track,step,cell\n4,0,1\n4,2,1\n", "track 4: step 2 follows step 0"),
+        ("track,step,cell\n4,0,1\n5,0,2\n4,0,1\n", "track 4: step 0 follows step 0"),
+        ('track,step,cell\nv,0,1\n"u,0",0,2\n"u,0",0,1\n', "track u,0: step 0 follows step 0"),
         ("track,cell\n0,1\n0,9\n", "cell of entry 2 is 9, expected 0 to 8 on a grid of 3x3 cells"),
         ("track,cell\n0,-1\n", "cell of entry 1 is -1, expected 0 to 8"),
         ("track,row,column\n0,1,3\n", "column of entry 1 is 3, expected 0 to 2"),

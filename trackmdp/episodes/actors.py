@@ -28,7 +28,8 @@ from trackmdp.policies.forms import (
     module_action,
     rule_of,
 )
-from trackmdp.policies.policy import Policy, PolicyLike, as_policy, looked_up
+from trackmdp.policies.lookup import Lookup
+from trackmdp.policies.policy import Policy, PolicyLike, as_policy
 from trackmdp.policies.table import SetTable
 from trackmdp.sensing.actions import ActionMask
 from trackmdp.sensing.detection import Detection
@@ -131,7 +132,8 @@ def actor_of(task: Task, policy: PolicyLike | Playback, costs: Costs) -> Actor:
     drawing = _writing(
         made.task, costs, lambda states, draws: made.act(states.key, states.misses, draws)
     )
-    return Actor(drawing, max(1, min(256, _DRAWS // made.num_draws)), made, made.num_draws)
+    draws = made.task.total_sensors
+    return Actor(drawing, max(1, min(256, _DRAWS // draws)), made, draws)
 
 
 def _writing(task: Task, costs: Costs, action_of: Acts) -> Decides:
@@ -156,9 +158,9 @@ def _following(policy: Policy, costs: Costs) -> Decides:
         sets = sparse.csr_array(np.full((1, policy.task.total_sensors), policy.probability == 1.0))
     cpu = torch.device("cpu")
     if coverage is None:
-        table = looked_up(sets, cpu) if alike else policy.lookup(cpu)
+        table = Lookup(sets, cpu) if alike else policy.lookup(cpu)
     else:
-        table = looked_up(SetTable(policy.task, sets, 1).reporting, cpu)
+        table = Lookup(SetTable(policy.task, sets, 1).reporting, cpu)
     # A CSR matrix's indptr is the place where each row's entries begin: 0 2 2 5 are rows of 2, 0 and 3 sensors.
     count, spent = torch.as_tensor(np.diff(sets.indptr).astype(np.int64)), costs.of_sets(sets)
 

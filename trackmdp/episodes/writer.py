@@ -99,19 +99,16 @@ class EpisodeWriter:
         self._writer = Writer(self._stream, enable_data_crcs=True)
         self._writer.start(library=f"trackmdp {run.said['trackmdp']}")
         # Once, and the numbers kept: registering a topic a second time would make a second channel of the same name.
-        self._channels = {
-            topic: self._register(topic, *said) for topic, said in run.schemas.items()
-        }
+        self._channels: dict[str, int] = {}
+        for topic, (name, description) in run.schemas.items():
+            text = schema.json_bytes(description)
+            number = self._writer.register_schema(name, "jsonschema", text)
+            self._channels[topic] = self._writer.register_channel(topic, "json", number)
         self._tell(schema.RUN, run.said)
         for name, content in tables.items():
             self._attach(name, content)
         # In the file at once: a log that is cut off later can be recovered only with its head.
         self.flush()
-
-    def _register(self, topic: str, name: str, description: dict[str, Any]) -> int:
-        text = schema.json_bytes(description)
-        number = self._writer.register_schema(name, "jsonschema", text)
-        return self._writer.register_channel(topic, "json", number)
 
     @property
     def episodes(self) -> int:
@@ -125,17 +122,14 @@ class EpisodeWriter:
             facts: description of the policy for readers of the log: its `label`.
             policy: from which `replay verify=true` simulates them again; None where there is none.
         """
-        if policy is None:
-            return self.copy_policy(facts, [])
+        tables: list[dict[str, Any]] = []
         if isinstance(policy, Rule):
-            tables = list(map(npz_bytes, policy.packed()))
-            return self.copy_policy({**facts, "merge": policy.name}, tables)
-        if policy.task.keyed:
-            known = {
-                name: str(getattr(policy.task, name)) for name in ("memory", "clip", "revealed")
-            }
-            facts = {**facts, **known}
-        return self.copy_policy(facts, [npz_bytes(packed(policy))])
+            facts, tables = {**facts, "merge": policy.name}, policy.packed()
+        elif policy is not None:
+            task, tables = policy.task, [packed(policy)]
+            names = ("memory", "clip", "revealed") if task.keyed else ()
+            facts = {**facts, **{name: str(getattr(task, name)) for name in names}}
+        return self.copy_policy(facts, list(map(npz_bytes, tables)))
 
     def copy_policy(self, facts: Mapping[str, str], tables: Sequence[bytes]) -> int:
         """Add a policy as it was read from another log: of each motion its table; none where it has none."""

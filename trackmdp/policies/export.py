@@ -144,15 +144,11 @@ def _to_sets(policy: PolicyTable, *_: object) -> bytes:
     return json.dumps(policy.as_lists()).encode()
 
 
-def _to_map(policy: PolicyTable, value: Array | None, _: dict[str, str]) -> bytes:
-    return json.dumps(map_features(policy, value)).encode()
-
-
 WRITERS: dict[str, Callable[[PolicyTable, Array | None, dict[str, str]], bytes]] = {
     ".onnx": to_onnx,
     ".pt2": to_torch,
     ".json": _to_sets,
-    ".geojson": _to_map,
+    ".geojson": lambda policy, value, _: json.dumps(map_features(policy, value)).encode(),
 }
 """Ending of a file -> its content, of a policy, its value and its metadata."""
 

@@ -227,13 +227,12 @@ def transformed(
     kept: list[Any] = []
     needed = set(module.in_keys)
     for part in reversed(parts):
-        if not isinstance(part, _STATELESS + _NORMS):
-            if read := needed & set(part.out_keys):
-                raise DrawsError(
-                    f"policy: reads {', '.join(map(str, read))} of {type(part).__name__}, which is no function of a "
-                    "state, so it has no exact value"
-                )
-            continue
-        needed |= set(part.in_keys)
-        kept.insert(0, part.to_observation_norm() if isinstance(part, _NORMS) else part.clone())
+        if isinstance(part, _STATELESS + _NORMS):
+            needed |= set(part.in_keys)
+            kept.insert(0, part.to_observation_norm() if isinstance(part, _NORMS) else part.clone())
+        elif read := needed & set(part.out_keys):
+            raise DrawsError(
+                f"policy: reads {', '.join(map(str, read))} of {type(part).__name__}, which is no function of a "
+                "state, so it has no exact value"
+            )
     return TensorDictSequential(*kept, module)

@@ -7,7 +7,6 @@ All plans together are a sparse matrix with a row per pair (x, n) and a column p
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
@@ -28,13 +27,11 @@ from trackmdp.policies.forms import (
     STATE_KEYS,
     acting,
     adapted,
-    function_rule,
     known_task,
-    module_rule,
     rule_of,
     transformed,
 )
-from trackmdp.policies.lookup import DenseTable, SparseTable, in_window
+from trackmdp.policies.lookup import Lookup, in_window
 from trackmdp.policies.saved import load_policy, save_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.policies.tracker import Tracker
@@ -45,8 +42,6 @@ from trackmdp.sensing.windows import Window
 PolicyLike: TypeAlias = Any
 """A policy or its table, a TensorDict module, a function as `Policy.from_function` takes it, or an object that holds a
 policy: a `Run`, a `Solution`, a dense table, a model of Stable-Baselines3."""
-
-_DENSE = 2**24  # entries; a table of no more is looked up dense, the faster of the two ways to act
 
 
 class Policy(TensorDictModuleBase, PolicyTable):
@@ -88,7 +83,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
         if task.keyed:
             self.in_keys = ["last_cell", "key", "steps_since_detection"]
         self.generator: torch.Generator | None = None
-        self._lookups: dict[tuple[torch.device, bool], DenseTable | SparseTable] = {}
+        self._lookups: dict[tuple[torch.device, bool], Lookup] = {}
 
     def __repr__(self) -> str:
         # The card, not the list of parts that torch shows of a module.
@@ -131,16 +126,13 @@ class Policy(TensorDictModuleBase, PolicyTable):
         Raises:
             UserError: it draws, or it returns something else; or `task` is none.
         """
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            known = known_task(task, None)
-            rule = function_rule(task, function)
-            return cls(known, unrolled(known, rule, "cpu", check=check))
+        return cls.from_module(task, function, check=check)
 
     @classmethod
     def from_module(
         cls,
         task: Task,
-        module: TensorDictModuleBase,
+        module: TensorDictModuleBase | Callable[..., Any],
         *,
         transform: Transform | None = None,
         device: torch.device | str = "cpu",
@@ -163,15 +155,9 @@ class Policy(TensorDictModuleBase, PolicyTable):
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             module = module if transform is None else transformed(module, transform)
             known = known_task(task, module)
-            rule = module_rule(known, module)
-            return cls(known, unrolled(known, rule, device, check=check))
+            return cls(known, unrolled(known, rule_of(known, module), device, check=check))
 
     # Acting.
-
-    @property
-    def num_draws(self) -> int:
-        """Uniform draws that one decision takes: none, or one per sensor."""
-        return 0 if self.deterministic else self.task.total_sensors
 
     def act(
         self, key: Tensor, steps_since_detection: Tensor, draws: Tensor | None = None
@@ -181,7 +167,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
         Args:
             key: `[*B]` int64, the memory of the last detection; the cell, where that is all.
             steps_since_detection: `[*B]` int64; where the safe action is forced the last set stands in, unused.
-            draws: `[*B, num_draws]` uniform in [0, 1), where the policy is not deterministic.
+            draws: `[*B, S]` uniform in [0, 1), where the policy is not deterministic.
         """
         probability = self.probabilities(key, steps_since_detection)
         if self.deterministic:
@@ -198,8 +184,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
     def probabilities(self, key: Tensor, steps_since_detection: Tensor) -> Tensor:
         """`[*B, S]` with which each sensor is switched on: bool for a deterministic policy, else float32."""
         device, shape = key.device, (*key.shape, self.task.total_sensors)
-        if self.sets is None:
-            assert self.probability is not None
+        if self.probability is not None:
             dtype = torch.bool if self.deterministic else torch.float32
             return torch.full(shape, self.probability, dtype=dtype, device=device)
         return self.lookup(device)(self.row(key, steps_since_detection))
@@ -211,17 +196,17 @@ class Policy(TensorDictModuleBase, PolicyTable):
         if self.sets is None:
             share = torch.as_tensor(self.share, device=key.device)
             return share.float().expand(*key.shape, -1)
-        return looked_up(self.seen, key.device)(self.row(key, steps_since_detection))
+        return Lookup(self.seen, key.device)(self.row(key, steps_since_detection))
 
     def row(self, key: Tensor, steps_since_detection: Tensor) -> Tensor:
         """`[*B]`, the row of `sets` for a state; where the safe action is forced, the row of the last free choice."""
         return key * self.task.num_choices + steps_since_detection.clamp_max(self.task.t_max)
 
-    def lookup(self, device: torch.device, *, local: bool = False) -> DenseTable | SparseTable:
+    def lookup(self, device: torch.device, *, local: bool = False) -> Lookup:
         """The rows of `sets` on a device, of all sensors or of those of the window alone."""
         if (device, local) not in self._lookups:
             table = in_window(self.task, self.sets) if local else self.sets
-            self._lookups[device, local] = looked_up(table, device)
+            self._lookups[device, local] = Lookup(table, device)
         return self._lookups[device, local]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -231,16 +216,16 @@ class Policy(TensorDictModuleBase, PolicyTable):
             UserError: a cell, a key or a number of misses is none of this policy's task.
         """
         last_cell, n = tensordict["last_cell"], tensordict["steps_since_detection"]
-        key = tensordict["key"] if self.task.keyed else last_cell
-        _check_range("key" if self.task.keyed else "last_cell", key, self.task.num_keys)
+        name = "key" if self.task.keyed else "last_cell"
+        key = tensordict[name]
+        _check_range(name, key, self.task.num_keys)
         _check_range("steps_since_detection", n, self.task.num_choices + 1)
         if self.deterministic:
             return tensordict.set("action", self._near(key, n))
         # A generator draws on its own device only.
         device = last_cell.device if self.generator is None else self.generator.device
-        draws = torch.rand(
-            (*last_cell.shape, self.num_draws), generator=self.generator, device=device
-        )
+        shape = *last_cell.shape, self.task.total_sensors
+        draws = torch.rand(shape, generator=self.generator, device=device)
         action = self.act(key, n, draws)
         if self.task.numbered is not None:
             action = Window.of(self.task, last_cell.device).to_local(last_cell, action)
@@ -303,16 +288,17 @@ def as_policy(task: Task, policy: PolicyLike) -> Policy:
         UserError: it belongs to another grid, or is not of these forms.
     """
     policy = adapted(task, policy)
-    if not isinstance(policy, PolicyTable):
-        where = _device_of(policy)
-        with acting():
-            known = known_task(task, policy)
-            sets = mixture(known, policy, where)
-            if sets is None:
-                sets = unrolled(known, rule_of(known, policy), where, check=True)
-        return Policy(known, sets)
-    policy.check_fits(task)
-    return policy if isinstance(policy, Policy) else Policy.from_table(policy)
+    if isinstance(policy, PolicyTable):
+        policy.check_fits(task)
+        return policy if isinstance(policy, Policy) else Policy.from_table(policy)
+    tensors = policy.parameters() if isinstance(policy, torch.nn.Module) else ()
+    where = next((weight.device for weight in tensors), torch.device("cpu"))
+    with acting():
+        known = known_task(task, policy)
+        sets = mixture(known, policy, where)
+        if sets is None:
+            sets = unrolled(known, rule_of(known, policy), where, check=True)
+    return Policy(known, sets)
 
 
 def _check_range(name: str, values: Tensor, count: int) -> None:
@@ -327,16 +313,3 @@ def _check_range(name: str, values: Tensor, count: int) -> None:
     for value in torch.stack(torch.aminmax(values)).tolist():
         if not 0 <= value < count:
             raise UserError(f"policy: {name}={value}, expected 0 to {count - 1}")
-
-
-def _device_of(policy: TensorDictModuleBase | Callable[..., Any]) -> torch.device:
-    """Where a module's first weight is; the CPU for one without, and for a function."""
-    if not isinstance(policy, torch.nn.Module):
-        return torch.device("cpu")
-    first = next(itertools.chain(policy.parameters(), policy.buffers()), None)
-    return torch.device("cpu") if first is None else first.device
-
-
-def looked_up(table: sparse.csr_array, device: torch.device) -> DenseTable | SparseTable:
-    """The faster way to look up rows of a table that does not cost too much memory."""
-    return (DenseTable if table.shape[0] * table.shape[1] <= _DENSE else SparseTable)(table, device)

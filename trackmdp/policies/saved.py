@@ -156,40 +156,23 @@ def _listed(task: Task, content: dict[str, Any]) -> PolicyTable:
         raise ValueError("sets of sensors of other footprints")
     if content["size"] != list(task.size):  # as many cells in other rows would fit
         raise ValueError(f"size {content['size']}, rows and columns; expected {list(task.size)}")
-    keys, count = content["sets"], task.num_keys
-    if not isinstance(keys, dict):
-        raise ValueError(f"sets: expected {count} plans by their keys")
+    plans, count = content["sets"], task.num_keys
     # Counted first: the memory in a stranger's file may make any number of keys.
-    if (
-        content["t_max"] != task.t_max
-        or len(keys) != count
-        or any(str(key) not in keys for key in range(count))
-    ):
+    if (content["t_max"], len(plans)) != (task.t_max, count):
         raise ValueError(
-            f"{len(keys)} plans, t_max {content['t_max']}; expected {count}, {task.t_max}"
+            f"{len(plans)} plans, t_max {content['t_max']}; expected {count}, {task.t_max}"
         )
-    rows = [each for key in range(count) for each in _plan(task, key, keys[str(key)])]
+    rows: list[list[int]] = []
+    for key in range(count):
+        plan = plans[str(key)]
+        if len(plan) != task.num_choices:
+            raise ValueError(f"plan {key}: expected {task.num_choices} lists of sensors")
+        for sensor in itertools.chain(*plan):
+            # numpy would cut 1.5 to 1, and take true for it.
+            if type(sensor) is not int or not 0 <= sensor < task.total_sensors:
+                most = task.total_sensors - 1
+                raise ValueError(f"plan {key}: sensor {sensor!r}, expected one from 0 to {most}")
+        rows += plan
     pointer = np.cumsum([0, *map(len, rows)])
-    indices = np.array([each for row in rows for each in row], dtype=np.int64)
+    indices = np.fromiter(itertools.chain(*rows), dtype=np.int64)
     return unpacked_policy(task, {"indices": indices, "indptr": pointer})
-
-
-def _plan(task: Task, key: int, sets: Any) -> list[list[int]]:
-    """The sets of one plan, for n = 0 ... t_max misses.
-
-    Raises:
-        ValueError: they are not that.
-    """
-    if (
-        not isinstance(sets, list)
-        or len(sets) != task.num_choices
-        or not all(isinstance(on, list) for on in sets)
-    ):
-        raise ValueError(f"plan {key}: expected {task.num_choices} lists of sensors")
-    for sensor in itertools.chain(*sets):
-        # numpy would cut 1.5 to 1, and take true for it.
-        if type(sensor) is not int or not 0 <= sensor < task.total_sensors:
-            raise ValueError(
-                f"plan {key}: sensor {sensor!r}, expected a whole number from 0 to {task.total_sensors - 1}"
-            )
-    return sets

@@ -94,8 +94,7 @@ class SetTable:
     def spent(self, n: int, price: Array) -> Array:
         """`[plans]` expected price of the sensors on after n misses; `price` `[S]` is per sensor."""
         if self.sets is None:
-            assert self.probability is not None
-            return np.full(self.plans, self.probability * float(price.sum()))
+            return np.full(self.plans, (self.probability or 0.0) * float(price.sum()))
         # Rows n, n + (t_max + 1), ...: those of (0, n), (1, n), ..., one per plan.
         rows = self.sets[n :: self.task.num_choices]
         return rows.astype(np.float64) @ price
@@ -202,14 +201,10 @@ class PolicyTable(Carded, SetTable):
         }
         if task.window is not None:
             facts["window"] = f"{task.window} cells around the last located cell"
-        for n, count in enumerate(self._mean_sensors()):
-            facts[f"sensors on at n = {n}"] = f"{decimal(count, 2)} of {task.total_sensors:,}"
+        for n in range(task.num_choices):
+            mean = float(self.spent(n, np.ones(task.total_sensors)).mean())
+            facts[f"sensors on at n = {n}"] = f"{decimal(mean, 2)} of {task.total_sensors:,}"
         return Card(f"{type(self).__name__}: {grid_words(task.size)}", facts)
-
-    def _mean_sensors(self) -> list[float]:
-        """Mean number of sensors on at n = 0 ... t_max, over all keys."""
-        one = np.ones(self.task.total_sensors)
-        return [float(self.spent(n, one).mean()) for n in range(self.task.num_choices)]
 
     @classmethod
     def all_on(cls, task: Task) -> Self:
@@ -308,9 +303,20 @@ class PolicyTable(Carded, SetTable):
         detection reveals the mode its kind is "cell", each cell's classes being the modes. Where sensors do not each
         cover the cell of their number, `footprints` lists the cells of each.
         """
-        keys, steps = range(self.task.num_keys), range(self.task.num_choices)
-        sets = {str(key): [self.sensors(key, n) for n in steps] for key in keys}
-        return self._of_task() | {"sets": sets}
+        task = self.task
+        # Facts that are missing have the paper's values.
+        facts: dict[str, Any] = {"size": list(task.size), "t_max": task.t_max}
+        if task.coverage is not None:
+            facts["footprints"] = task.coverage.as_lists()
+        if task.place is not None:
+            facts["place"] = task.place.facts()
+        if task.keyed:
+            own = {"kind": task.memory, "clip": task.clip, "classes": task.keys.num_classes}
+            own |= {"revealed": task.revealed} if task.revealed > 1 else {}
+            facts["memory"] = own | task.keys.recipe()
+        steps = range(task.num_choices)
+        sets = {str(key): [self.sensors(key, n) for n in steps] for key in range(task.num_keys)}
+        return facts | {"sets": sets}
 
     def sensors(self, key: int, misses: int) -> list[int]:
         """The sensors with a probability above 0, n misses after the detection that left `key`."""
@@ -329,24 +335,6 @@ class PolicyTable(Carded, SetTable):
         assert self.sets is not None
         row = key * self.task.num_choices + misses
         return slice(*self.sets.indptr[row : row + 2])
-
-    def _of_task(self) -> dict[str, Any]:
-        """The facts that a reader of the lists needs; missing ones have the paper's values."""
-        task = self.task
-        facts: dict[str, Any] = {"size": list(task.size), "t_max": task.t_max}
-        if task.coverage is not None:
-            facts["footprints"] = task.coverage.as_lists()
-        if task.place is not None:
-            facts["place"] = task.place.facts()
-        if task.keyed:
-            facts["memory"] = {
-                "kind": task.memory,
-                "clip": task.clip,
-                "classes": task.keys.num_classes,
-            }
-            facts["memory"] |= {"revealed": task.revealed} if task.revealed > 1 else {}
-            facts["memory"] |= task.keys.recipe()
-        return facts
 
 
 def _quick(table: sparse.csr_array) -> Any:

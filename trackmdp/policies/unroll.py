@@ -89,13 +89,19 @@ def mixture(task: Task, module: Any, device: torch.device) -> sparse.csr_array |
 
     def probabilities(filled: bool) -> Rule:
         def rule(*state: Tensor) -> Tensor:
-            known = torch.full_like(state[2], filled) & _taken(state[1], state[2])
+            # Slots n and later are empty in any history.
+            slots = torch.arange(task.num_choices, device=state[1].device)
+            taken = (slots < state[1].unsqueeze(1)).unsqueeze(-1) & filled
+            known = taken.expand_as(state[2])
             rows = dict(zip(names, (*state[:2], known, *state[3:]), strict=True))
             batch = TensorDict(rows, state[0].shape).to(device)
-            chances = _bernoulli(module.get_dist(observed(task, module, batch)))
-            if chances is None or chances.shape != (len(state[0]), task.num_sensors):
+            found = module.get_dist(observed(task, module, batch))
+            while isinstance(found, distributions.Independent):
+                found = found.base_dist
+            shape = len(state[0]), task.num_sensors
+            if not isinstance(found, distributions.Bernoulli) or found.probs.shape != shape:
                 raise _NoProbabilitiesError
-            return chances
+            return found.probs.double()
 
         return rule
 
@@ -117,19 +123,6 @@ def mixture(task: Task, module: Any, device: torch.device) -> sparse.csr_array |
 
 class _NoProbabilitiesError(Exception):
     """A distribution that is not a Bernoulli per sensor."""
-
-
-def _taken(misses: Tensor, history: Tensor) -> Tensor:
-    """`[B, t_max+1, 1]` bool, the slots of a history that hold an action after `misses` `[B]`."""
-    slots = torch.arange(history.shape[1], device=misses.device)
-    return (slots < misses.unsqueeze(1)).unsqueeze(-1)
-
-
-def _bernoulli(found: distributions.Distribution) -> Tensor | None:
-    """`[B, K]` probabilities of a Bernoulli, however often it is wrapped in `Independent`."""
-    while isinstance(found, distributions.Independent):
-        found = found.base_dist
-    return found.probs.double() if isinstance(found, distributions.Bernoulli) else None
 
 
 @torch.no_grad()
@@ -180,5 +173,5 @@ def _followed(rule: Rule, task: Task, keys: Tensor, dtype: torch.dtype) -> AnyAr
 
 def _generator_states() -> list[Tensor]:
     """States of torch's global generators, on the CPU and on all GPUs in use."""
-    in_use = torch.cuda.is_available() and torch.cuda.is_initialized()
-    return [torch.get_rng_state(), *(torch.cuda.get_rng_state_all() if in_use else [])]
+    gpus = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
+    return [torch.get_rng_state(), *gpus]

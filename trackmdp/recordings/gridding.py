@@ -75,8 +75,13 @@ def to_tracks(
         UserError: the projection does not fit the positions, or no track is left.
     """
     flat, place = _placed(positions, grid, source, ~np.isin(positions.track, held_out))
-    if not positions.geographic:
-        _check_extent(flat, grid, source)
+    wide, high = np.ptp(_spread(flat.x, flat.y), axis=1)
+    # 0: nothing moves
+    if not positions.geographic and 0 < max(wide, high) < grid.cell / _PARTS:
+        raise UserError(
+            f"{source}: nearly all positions lie within {wide:.3g} x {high:.3g}, far less than a cell "
+            f"(grid.cell={grid.cell:g}); expected a smaller cell, or columns lat and lon for degrees"
+        )
     begin, x, y, last = _sampled(flat, grid)
     cells = place.cells(x, y, grid.size)
     tracks, counts = _cut(cells, begin, last, flat, grid)
@@ -93,28 +98,15 @@ def to_tracks(
     if not len(tracks):
         raise UserError(f"{source}: no track of at least {grid.shortest} cells; {said(report)}")
     if counts[_OUTSIDE]:  # the grid.size that would do, where the default was forgotten
-        wide, high = (max(1, math.ceil(each / grid.cell)) for each in _extent(flat))
-        report |= {"rows that nearly all positions span": high, "columns that they span": wide}
+        columns, rows = (max(1, math.ceil(each / grid.cell)) for each in (wide, high))
+        report |= {"rows that nearly all positions span": rows, "columns that they span": columns}
     return tracks, report, place
 
 
-def _check_extent(flat: Positions, grid: Gridding, source: str) -> None:
-    """Refuse positions that are all about one cell, as degrees in columns x and y are."""
-    wide, high = _extent(flat)
-    if 0 < max(wide, high) < grid.cell / _PARTS:  # 0: nothing moves
-        raise UserError(
-            f"{source}: nearly all positions lie within {wide:.3g} x {high:.3g}, far less than a cell "
-            f"(grid.cell={grid.cell:g}); expected a smaller cell, or columns lat and lon for degrees"
-        )
-
-
-def _extent(flat: Positions) -> tuple[float, float]:
-    """Width and height of nearly all positions, from the 1st to the 99th percentile; inf without any."""
-    known = [column[np.isfinite(column)] for column in (flat.x, flat.y)]
-    wide, high = (
-        float(np.ptp(np.percentile(column, (1, 99)))) if len(column) else np.inf for column in known
-    )
-    return wide, high
+def _spread(x: Array, y: Array) -> Array:
+    """`[2, 2]` 1st and 99th percentile of x and of y, between which nearly all positions lie; nan without any."""
+    known = (column[np.isfinite(column)] for column in (x, y))
+    return np.array([np.percentile(each, (1, 99)) if len(each) else [np.nan] * 2 for each in known])
 
 
 def said(report: Mapping[str, int]) -> str:
@@ -136,12 +128,13 @@ def _placed(
         raise UserError(
             f"{source}: has x and y, which are not projected; grid.crs={grid.crs} is for lat and lon"
         )
-    corner = (
-        _middle(flat.x[says], flat.y[says], grid)
-        if grid.origin is None
-        else projected(code, grid.origin)
-    )
-    return flat, Place(corner, grid.cell, code, positions.downwards)
+    if grid.origin is not None:
+        return flat, Place(projected(code, grid.origin), grid.cell, code, positions.downwards)
+    # Grid and positions have the same middle: half way between the 1st and the 99th percentile, so that a few reports
+    # from nowhere do not move the grid. Without any position it may lie anywhere.
+    middle = np.nan_to_num(_spread(flat.x[says], flat.y[says]).mean(axis=1))
+    right, low = (middle - np.array(grid.size[::-1]) * grid.cell / 2).tolist()
+    return flat, Place((right, low), grid.cell, code, positions.downwards)
 
 
 def _seams(lon: Array, x: Array, y: Array) -> np.ndarray:
@@ -207,18 +200,6 @@ def _sampled(positions: Positions, grid: Gridding) -> tuple[np.ndarray, Array, A
     np.maximum.at(latest, positions.track, positions.time)
     final = positions.time[end] == latest[positions.track[end]]
     return start[of], x, y, final[of]
-
-
-def _middle(x: Array, y: Array, grid: Gridding) -> tuple[float, float]:
-    """The smallest x and y of the grid, in metres, if grid and positions have the same middle."""
-    # Half way between the 1st and the 99th percentile: a few reports from nowhere do not move the grid.
-    known = [column[np.isfinite(column)] for column in (x, y)]
-    # Without one the grid may lie anywhere.
-    right, up = (
-        float(np.percentile(column, (1, 99)).mean()) if len(column) else 0.0 for column in known
-    )
-    rows, columns = grid.size
-    return right - columns * grid.cell / 2, up - rows * grid.cell / 2
 
 
 def _cut(

@@ -18,7 +18,6 @@ import numpy as np
 
 from trackmdp.arrays.files import first_line
 from trackmdp.arrays.types import Array
-from trackmdp.errors import UserError
 from trackmdp.untrusted import parse_json
 
 LONGEST = 2**30
@@ -130,11 +129,9 @@ def _number(column: Any, name: str) -> Any:
     import pandas as pd
 
     series = pd.Series(column)
-    try:
-        return pd.to_numeric(series, errors="raise").astype(np.float64)
-    except (TypeError, ValueError):
-        _refuse_entry(series, pd.to_numeric(series, errors="coerce"), name, "a number")
-        raise
+    found = pd.to_numeric(series, errors="coerce").astype(np.float64)
+    _refuse_entry(series, found, name, "a number")
+    return found
 
 
 def _refuse_entry(column: Any, parsed: Any, name: str, expected: str) -> None:
@@ -303,10 +300,7 @@ def geojson(stream: BinaryIO) -> Positions:
     A point has an id and a time among its properties; a line has a list of times there, one for each point, and is a
     target of its own where it has no id.
     """
-    try:
-        content = parse_json(stream.read(), "its content")
-    except UserError as error:
-        raise ValueError(str(error)) from error  # so that the message begins with the file
+    content = parse_json(stream.read(), "its content")
     features = content["features"] if content["type"] == "FeatureCollection" else [content]
     rows = [row for number, feature in enumerate(features) for row in _feature(feature, number)]
     return table_of(*_columns(rows, 5), geographic=True)

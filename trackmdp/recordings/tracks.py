@@ -353,8 +353,6 @@ def _check_steps(source: str, track: Indices, step: Indices, texts: Sequence[str
         return
     at = int(np.flatnonzero(bad)[0])
     name = texts[track[at]] if texts else track[at]
-    if jump[at] == 0:
-        raise UserError(f"{source}: track {name} has step {step[at]} twice")
     raise UserError(
-        f"{source}: track {name} has a gap: step {step[at + 1]} follows step {step[at]}"
+        f"{source}: track {name}: step {step[at + 1]} follows step {step[at]}, expected {step[at] + 1}"
     )

@@ -75,10 +75,10 @@ def test_what_cannot_be_is_refused(
 BAD = {
     "gap": (
         "track,step,cell\n0,0,1\n0,1,1\n0,3,1\n0,4,1\n",
-        "track 0 has a gap: step 3 follows step 1",
+        "track 0: step 3 follows step 1, expected 2",
     ),
     "outside": ("track,cell\n0,1\n0,9\n0,1\n0,1\n", "cell of entry 2 is 9"),
-    "twice": ("track,step,cell\n0,0,1\n0,1,1\n0,1,2\n0,2,1\n", "track 0 has step 1 twice"),
+    "twice": ("track,step,cell\n0,0,1\n0,1,1\n0,1,2\n0,2,1\n", "track 0: step 1 follows step 1"),
     "fraction": (
         "track,cell\n0,1\n0,0.5\n0,1\n0,1\n",
         "cell of entry 2 is 0.5, expected an integer",
