@@ -84,7 +84,11 @@ def test_the_sensitivity_is_the_range_over_the_draws() -> None:
     worlds = [paper_world(paper_kernel(4, seed, "clip"), 0.2, 2) for seed in range(3)]
     exact = [evaluate(world, rules.qmdp(world)) for world in worlds]
     accuracy = sorted(100 * e.accuracy for e in exact)
-    assert vars(one.accuracy) == {"median": accuracy[1], "low": accuracy[0], "high": accuracy[2]}
+    assert one.accuracy._asdict() == {
+        "median": accuracy[1],
+        "low": accuracy[0],
+        "high": accuracy[2],
+    }
     assert one.qmdp.median == np.median([e.aihtr for e in exact])
     assert one.clocked.high == max(bounds.clocked(world).mean() for world in worlds)
     best = candidates(4, border="clip", t_max=2, seeds=range(3))[0]

@@ -14,7 +14,7 @@ from tests.helpers import headings
 from tests.solvers.worlds import paper_world
 from trackmdp.paper import histories, proofs, theorems
 from trackmdp.paper.check import Check
-from trackmdp.paper.corner import changed, corner, dearer
+from trackmdp.paper.corner import corner, dearer
 from trackmdp.policies.belief import BeliefFilter
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, estimator, hidden, optimal, pomdp, rules
@@ -43,7 +43,7 @@ def of_cells(solved: list[Any]) -> Iterator[Check]:
 
 def of_modes(solved: list[Any]) -> Iterator[Check]:
     for row in theorems.check_modes(HIDDEN, solved[2], 1e-9):
-        yield replace(row, name=f"{row.name}, modes")
+        yield row._replace(name=f"{row.name}, modes")
 
 
 def claim(row: Check) -> str:
@@ -85,7 +85,7 @@ def elsewhere(module: Any, name: str, *, modes: bool = False, **changes: Any) ->
         def faulty(world: Any, *given: Any, **words: Any) -> Any:
             if (world.modes > 1) == modes:
                 new = {key: f(world) if callable(f) else f for key, f in changes.items()}
-                world = changed(world, **new)
+                world = world.but(**new)
             return real(world, *given, **words)
 
         patch.setattr(module, name, faulty)

@@ -6,13 +6,13 @@ The computed settings are stored beside the results as `paper.json`.
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
+from itertools import product, starmap
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,8 +37,7 @@ HORIZONS = (0, 1, 2)
 DRAWS = range(30)
 
 
-@dataclass(frozen=True)
-class Candidate:
+class Candidate(NamedTuple):
     """One draw of the kernel.
 
     Attributes:
@@ -50,12 +49,11 @@ class Candidate:
 
     support_size: int
     seed: int
-    accuracy: tuple[float, ...]
+    accuracy: Sequence[float]
     deviation: float
 
 
-@dataclass(frozen=True)
-class Spread:
+class Spread(NamedTuple):
     """Median and range over draws."""
 
     median: float
@@ -63,8 +61,7 @@ class Spread:
     high: float
 
 
-@dataclass(frozen=True)
-class Setting:
+class Setting(NamedTuple):
     """The figures of a pair under one choice of the unstated settings, over draws of the kernel.
 
     Attributes:
@@ -92,7 +89,7 @@ def candidates(
     """Every draw, the best first; ties go to the lower seed."""
     accuracy = _figures(border, t_max, support_size, seeds)[:, :, 0]
     deviations = _deviations(support_size, accuracy)
-    rows = zip(seeds, map(tuple, accuracy.tolist()), deviations.tolist(), strict=True)
+    rows = zip(seeds, accuracy.tolist(), deviations.tolist(), strict=True)
     return sorted((Candidate(support_size, *row) for row in rows), key=_rank)
 
 
@@ -110,7 +107,7 @@ def chosen(every: Iterable[Candidate]) -> dict[int, int]:
 
 def sensitivity(draws: Sequence[int] = DRAWS) -> Iterator[Setting]:
     """Every border rule with every T_max, for each pair of the paper."""
-    for border, t_max, support_size in itertools.product(_BORDERS, HORIZONS, SUPPORTS):
+    for border, t_max, support_size in product(_BORDERS, HORIZONS, SUPPORTS):
         figures = _figures(border, t_max, support_size, draws)
         # Over all four prices at once, hence one number for Z that every price's `Setting` repeats.
         deviation = float(_deviations(support_size, figures[:, :, 0]).min())
@@ -118,8 +115,8 @@ def sensitivity(draws: Sequence[int] = DRAWS) -> Iterator[Setting]:
         spreads = np.stack(
             [np.median(figures, axis=0), figures.min(axis=0), figures.max(axis=0)], axis=2
         )
-        for cost, spread in zip(COSTS, spreads.tolist(), strict=True):
-            accuracy, simple, clocked = (Spread(*each) for each in spread)
+        for cost, each in zip(COSTS, spreads.tolist(), strict=True):
+            accuracy, simple, clocked = starmap(Spread, each)
             yield Setting(border, t_max, support_size, cost, accuracy, simple, clocked, deviation)
 
 
@@ -151,7 +148,7 @@ HARDEST = 5
 
 @dataclass(frozen=True)
 class Openings:
-    """Candidate kernels, the effect of the unstated settings, and the statements checked."""
+    """Candidate kernels, by Z and the best first, the effect of the unstated settings, and the statements checked."""
 
     candidates: list[Candidate]
     settings: list[Setting]
@@ -182,10 +179,8 @@ def checks(seed: int) -> list[Check]:
 
 def save_openings(openings: Openings, folder: Path) -> None:
     """Write `paper.json`."""
-    write_text(
-        folder / OPENINGS_FILE,
-        json.dumps(_packed(openings), separators=(",", ":"), ensure_ascii=False) + "\n",
-    )
+    text = json.dumps(_packed(openings), separators=(",", ":"), ensure_ascii=False)
+    write_text(folder / OPENINGS_FILE, text + "\n")
 
 
 def load_openings(folder: Path) -> Openings | None:
@@ -202,14 +197,12 @@ def load_openings(folder: Path) -> Openings | None:
 
 
 def _packed(openings: Openings) -> dict[str, Any]:
-    return {
-        name: [_rounded(astuple(each)) for each in found] for name, found in vars(openings).items()
-    }
+    return {name: _rounded(found) for name, found in vars(openings).items()}
 
 
 def _rounded(value: Any) -> Any:
     """Numbers of six digits, as further ones may differ from machine to machine; -inf ("no case"), as a text."""
-    if isinstance(value, tuple):
+    if isinstance(value, (list, tuple)):
         return [_rounded(each) for each in value]
     if isinstance(value, float):
         return float(f"{value:.6g}") if math.isfinite(value) else repr(value)
@@ -221,16 +214,9 @@ def _unpacked(plain: dict[str, Any]) -> Openings:
         [Candidate(*row) for row in plain["candidates"]],
         [
             Setting(
-                border,
-                t_max,
-                z,
-                cost,
-                Spread(*accuracy),
-                Spread(*qmdp),
-                Spread(*clocked),
-                deviation,
-            )
-            for border, t_max, z, cost, accuracy, qmdp, clocked, deviation in plain["settings"]
+                *row[:4], *starmap(Spread, row[4:7]), *row[7:]
+            )  # of row[4:7] each has three numbers
+            for row in plain["settings"]
         ],
         [
             Check(name, statement, float(deviation), *rest)

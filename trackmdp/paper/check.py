@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-
-import numpy as np
+from typing import NamedTuple
 
 NO_CASE = float("-inf")
 """Deviation of a statement that has no case in a world."""
@@ -17,8 +15,7 @@ _WORDS = {
 }
 
 
-@dataclass(frozen=True)
-class Check:
+class Check(NamedTuple):
     """One statement and its largest deviation in a world.
 
     Attributes:
@@ -41,13 +38,13 @@ class Check:
 
     def judged(self, scale: float, *, closed: bool = True) -> Check:
         """The check with `holds`: whether the deviation is at most `scale`."""
-        return replace(self, holds=self.deviation <= scale, closed=self.closed and closed)
+        return self._replace(holds=self.deviation <= scale, closed=self.closed and closed)
 
     def of_cases(self, due: int) -> Check:
         """The check, failed if it has looked at no case where there are `due` cases, counted in another way."""
-        missed = due > 0 and self.deviation == NO_CASE
-        note = f"looked at none of {due} cases"
-        return replace(self, deviation=np.inf, note=note) if missed else self
+        if self.deviation > NO_CASE or not due:
+            return self
+        return self._replace(deviation=float("inf"), note=f"looked at none of {due} cases")
 
     @property
     def verdict(self) -> str:

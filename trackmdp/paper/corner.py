@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from trackmdp.world.model import World
@@ -11,8 +9,8 @@ from trackmdp.world.model import World
 SIDE = 2
 
 
-def corner(world: World) -> Any:
-    """The top left 2 x 2 cells, or fewer, with their modes; leaving them is exiting. T_max is at most 2.
+def corner(world: World) -> World:
+    """The top left 2 x 2 cells, or fewer, with their modes; leaving them is exiting. T_max is at most 2; no window.
 
     The value is undiscounted, and finite only where the target exits: rows above .99 are scaled to .99. The price D of
     the safe action shrinks with the number of cells, as the sum of all prices does.
@@ -24,30 +22,23 @@ def corner(world: World) -> Any:
     states = (cells[:, None] * modes + np.arange(modes)).ravel()
     kernel = world.kernel[states][:, states].toarray()
     kernel *= 0.99 / np.maximum(kernel.sum(axis=1, keepdims=True), 0.99)
-    sensors = {
-        name: getattr(world, name)[cells] for name in ("cost", "detection", "safe_detection")
+    given = world.given | {
+        "size": (rows, columns),
+        "t_max": min(world.t_max, 2),
+        "max_steps": None,
+        "window": None,
+        "safe_cost": world.safe_cost * len(cells) / world.num_cells,
+        "memory": "cell",
     }
-    return changed(
-        world,
-        kernel,
-        size=(rows, columns),
-        t_max=min(world.t_max, 2),
-        safe_cost=world.safe_cost * len(cells) / world.num_cells,
-        memory="cell",
-        **sensors,
-    )
+    for name in ("cost", "detection", "safe_detection"):
+        given[name] = getattr(world, name)[cells]
+    return World(kernel, modes=world.modes, **given)
 
 
-def dearer(world: World) -> Any:
+def dearer(world: World) -> World:
     """The world with sensors a little dearer than the likeliest move is worth.
 
     Above r max P no sensor earns its price by the next reward alone: misses happen, beliefs spread, the clock runs on.
     """
     cost = np.maximum(world.cost, 1.05 * world.reward * float(world.kernel.max()))
-    return changed(world, cost=cost, safe_cost=max(world.safe_cost, float(cost.sum())))
-
-
-def changed(world: World, kernel: Any = None, **changes: Any) -> Any:
-    """A copy for whole episodes without a window, with another kernel or other arguments of its task."""
-    arguments = world.given | {"max_steps": None, "window": None} | changes
-    return World(world.kernel if kernel is None else kernel, modes=world.modes, **arguments)
+    return world.but(cost=cost, safe_cost=max(world.safe_cost, float(cost.sum())))

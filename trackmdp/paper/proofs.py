@@ -11,13 +11,7 @@ import numpy as np
 
 from trackmdp.arrays.types import Array
 from trackmdp.paper.check import NO_CASE, Check
-from trackmdp.paper.corner import changed
-from trackmdp.paper.exhaustive import (
-    best_worth,
-    clocked_value,
-    policy_value,
-    revealed_value,
-)
+from trackmdp.paper.exhaustive import best_worth, clocked_value, policy_value, revealed_value
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, optimal, pomdp, rules
 from trackmdp.solvers.certify.inner import InnerProblem
@@ -34,7 +28,7 @@ _SLACK = 1e-10
 def of_values(small: World) -> Iterator[Check]:
     """Exact values against those of the chain of states, for a drawn policy, with and without misses."""
     rng = np.random.default_rng(0)
-    worlds = (small, changed(small, detection=0.8, safe_detection=0.7))
+    worlds = (small, small.but(detection=0.8, safe_detection=0.7))
     worst = NO_CASE
     for world in worlds:
         sets = rng.random((world.num_keys, world.num_choices, world.num_cells)) < 0.5
@@ -50,16 +44,17 @@ def of_values(small: World) -> Iterator[Check]:
 
 def of_bounds(small: World) -> Iterator[Check]:
     """The clocked and the valid bound against value iteration."""
-    statement = "the clocked bound solves its equation"
-    error = float(np.abs(bounds.valid(small) - revealed_value(small)).max())
-    yield Check("bound", "the valid bound solves its equation", error, note="on the corner")
-    error = float(np.abs(bounds.clocked(small) - clocked_value(small)).max())
-    yield Check("bound", statement, error, note="on the corner")
+    for kind, bound, expected in (
+        ("valid", bounds.valid(small), revealed_value(small)),
+        ("clocked", bounds.clocked(small), clocked_value(small)),
+    ):
+        error = float(np.abs(bound - expected).max())
+        yield Check("bound", f"the {kind} bound solves its equation", error, note="on the corner")
 
 
 def of_searches() -> Iterator[Check]:
     """Branch and bound over a poor policy, in worlds that need it, against all plans and the POMDP's optimum."""
-    tree, bracket, payment = NO_CASE, NO_CASE, NO_CASE
+    tree = payment = bracket = NO_CASE
     for world in searched_worlds():
         value = value_of(world, rules.qmdp(world)).value
         exact = best_worth(world, value, np.eye(world.num_cells), world.num_choices)
@@ -74,12 +69,15 @@ def of_searches() -> Iterator[Check]:
         # The last search came to its end.
         tree = max(tree, float(np.abs(best - exact).max()))
     note = "over Q_MDP's policy on 2 x 2 cells, cut early and searched to the end"
-    statement = "branch and bound has the best of all plans, and no bound below it"
-    yield Check("search", statement, tree, note=note).of_cases(1)
-    statement = "the bound that branch and bound proves of any policy is above the POMDP's optimum"
-    yield Check("search", statement, payment, note=note).of_cases(1)
-    statement = "the POMDP's optimum is in the bracket of solve"
-    yield Check("search", statement, bracket, note=note).of_cases(1)
+    for statement, deviation in (
+        ("branch and bound has the best of all plans, and no bound below it", tree),
+        (
+            "the bound that branch and bound proves of any policy is above the POMDP's optimum",
+            payment,
+        ),
+        ("the POMDP's optimum is in the bracket of solve", bracket),
+    ):
+        yield Check("search", statement, deviation, note=note).of_cases(1)
 
 
 def searched_worlds() -> Iterator[World]:

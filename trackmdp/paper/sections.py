@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import astuple, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from trackmdp.arrays.types import Array
 from trackmdp.paper import calibration
-from trackmdp.paper.calibration import DRAWS, Candidate, Openings, Setting, Spread, chosen
-from trackmdp.paper.check import Check
+from trackmdp.paper.calibration import DRAWS, Candidate, Openings, Setting, chosen
+from trackmdp.paper.check import NO_CASE, Check
 from trackmdp.paper.worlds import COSTS, PRINTED_QMDP, PRINTED_TMDP, SUPPORTS, Pairs, pairs
 from trackmdp.reports.grouping import Study
 from trackmdp.reports.page import Part, Section
-from trackmdp.reports.style import INK, LOOKS, Axes, Canvas, Figure, draw_figure, legend, tidy
+from trackmdp.reports.style import INK, LOOKS, Canvas, Figure, draw_figure, legend, tidy
 from trackmdp.reports.tables import Cell, Column, Rows, Table, paragraphs
 
 # One colour per Z through all figures of this part; they are those of methods, which do not occur here.
@@ -29,43 +27,29 @@ def candidates_table(every: Sequence[Candidate]) -> Table:
     seeds = chosen(every)
     columns = [Column("Z"), Column("seed"), Column("deviation", 2, "points")]
     columns += [Column(f"accuracy at c = {cost:g}", 2, "%") for cost in COSTS]
-    ordered = sorted(every, key=lambda c: (c.support_size, c.deviation, c.seed))
+    columns.append(Column("chosen"))
     rows = [
         [c.support_size, c.seed, c.deviation, *c.accuracy, seeds[c.support_size] == c.seed]
-        for c in ordered
+        for c in every
     ]
-    return Table(
-        "calibration", f"All {len(rows)} candidate kernels", [*columns, Column("chosen")], rows
-    )
+    return Table("calibration", f"All {len(rows)} candidate kernels", columns, rows)
 
 
 def calibration_figure(every: Sequence[Candidate]) -> Figure:
     """Every candidate's deviation, the chosen one marked."""
-    seeds = chosen(every)
 
     def paint(figure: Canvas) -> None:
         axes = figure.subplots()
         for support_size, style in COLOURS.items():
-            mine = sorted(
-                (c for c in every if c.support_size == support_size), key=lambda c: c.seed
-            )
+            best, *_ = mine = [c for c in every if c.support_size == support_size]
             # One band per Z; within it the seed is the height, only to keep the dots apart.
             height = [support_size + 0.6 * (c.seed / len(mine) - 0.5) for c in mine]
-            axes.plot(
-                [c.deviation for c in mine],
-                height,
-                ".",
-                color=style.color,
-                markersize=4,
-                alpha=0.7,
-            )
-            best = next(c for c in mine if c.seed == seeds[support_size])
-            place = support_size + 0.6 * (best.seed / len(mine) - 0.5)
-            axes.plot(
-                [best.deviation], [place], "o", color=INK, markersize=8, markerfacecolor="none"
-            )
+            deviations = [c.deviation for c in mine]
+            axes.plot(deviations, height, ".", color=style.color, markersize=4, alpha=0.7)
+            at = deviations[0], height[0]
+            axes.plot(*at, "o", color=INK, markersize=8, markerfacecolor="none")
             # To the left: the chosen one is the leftmost of its band, so that the label meets no other dot.
-            label, at = f"seed {best.seed}", (best.deviation, place)
+            label = f"seed {best.seed}"
             axes.annotate(label, at, (-8, 0), textcoords="offset points", ha="right", va="center")
         # Deviations differ by factors, and the choice is among the smallest.
         axes.set(xscale="log", xlabel="largest deviation from the printed accuracy (points)")
@@ -83,18 +67,12 @@ def fit_table(settings: Sequence[Setting]) -> Table:
     fits: dict[tuple[str, int], dict[int, float]] = {}
     for setting in settings:
         # `deviation` covers all prices, so the settings of one Z that differ in c write the same number.
-        fits.setdefault((setting.border, setting.t_max), {})[setting.support_size] = (
-            setting.deviation
-        )
+        fit = fits.setdefault((setting.border, setting.t_max), {})
+        fit[setting.support_size] = setting.deviation
     ordered = sorted(fits.items(), key=lambda item: max(item[1].values()))
-    rows: Rows = [
-        [*setting, *(fit[z] for z in SUPPORTS), max(fit.values())] for setting, fit in ordered
-    ]
-    columns = [
-        Column("border"),
-        Column("T_max"),
-        *(Column(f"Z = {z}", 2, "points") for z in SUPPORTS),
-    ]
+    rows: Rows = [[*at, *(fit[z] for z in SUPPORTS), max(fit.values())] for at, fit in ordered]
+    columns = [Column("border"), Column("T_max")]
+    columns += [Column(f"Z = {z}", 2, "points") for z in SUPPORTS]
     caption = (
         f"Smallest deviation from the printed Q_MDP accuracy among {len(DRAWS)} draws, by setting"
     )
@@ -106,10 +84,7 @@ def sensitivity_table(settings: Sequence[Setting]) -> Table:
     columns = [Column("border"), Column("T_max"), Column("Z"), Column("c", 2)]
     for label, digits in (("Q_MDP accuracy %", 2), ("Q_MDP AIHTR", 1), ("clocked bound AIHTR", 1)):
         columns += _spread_columns(digits, f"{label}, ")
-    rows = [
-        [*at, *accuracy, *simple, *clocked]
-        for *at, accuracy, simple, clocked, _ in map(astuple, settings)
-    ]
+    rows = [[*s[:4], *s.accuracy, *s.qmdp, *s.clocked] for s in settings]
     caption = f"Median and range over {len(DRAWS)} draws of the kernel, by setting and pair"
     return Table("sensitivity", caption, columns, rows)
 
@@ -122,38 +97,39 @@ def _spread_columns(digits: int, head: str = "") -> list[Column]:
 def sensitivity_figures(settings: Sequence[Setting]) -> list[Figure]:
     """Accuracy of Q_MDP, its AIHTR and the clocked bound under each setting, at the lowest price."""
     # At the lowest price all probabilities but 0.15 exceed c/r, and Table II prints one accuracy for three prices.
-    cost = COSTS[0]
-    mine = [setting for setting in settings if setting.cost == cost]
+    mine = [setting for setting in settings if setting.cost == COSTS[0]]
     return [
-        _ranges("accuracy", "Accuracy of Q_MDP (%)", mine, lambda s: s.accuracy, printed=True),
-        _ranges("qmdp", "AIHTR of Q_MDP", mine, lambda s: s.qmdp),
-        _ranges("clocked", "AIHTR of the clocked bound", mine, lambda s: s.clocked),
+        _ranges("accuracy", "Accuracy of Q_MDP (%)", mine),
+        _ranges("qmdp", "AIHTR of Q_MDP", mine),
+        _ranges("clocked", "AIHTR of the clocked bound", mine),
     ]
 
 
-def _ranges(
-    name: str,
-    label: str,
-    settings: Sequence[Setting],
-    of: Callable[[Setting], Spread],
-    *,
-    printed: bool = False,
-) -> Figure:
+def _ranges(name: str, label: str, settings: Sequence[Setting]) -> Figure:
+    """Medians and ranges of the figure `name` of settings of one price."""
     rows = list(dict.fromkeys((s.border, s.t_max) for s in settings))
+    printed = name == "accuracy"
 
     def paint(figure: Canvas) -> None:
         axes = figure.subplots()
         # The three Z of a setting stand in one row, a little apart.
-        for offset, support_size in zip((-0.24, 0.0, 0.24), COLOURS, strict=True):
-            spreads = [astuple(of(s)) for s in settings if s.support_size == support_size]
-            _draw_range(axes, np.array(spreads).T, np.arange(len(rows)) + offset, support_size)
+        for offset, (support_size, look) in zip((-0.24, 0.0, 0.24), COLOURS.items(), strict=True):
+            spreads = [getattr(s, name) for s in settings if s.support_size == support_size]
+            middle, low, high = np.array(spreads).T
+            # Lengths below and above the median. The range, not a confidence interval: how far the draw of the kernel
+            # moves a figure.
+            axes.errorbar(
+                *(middle, np.arange(len(rows)) + offset),
+                xerr=np.stack([middle - low, high - middle]),
+                label=f"Z = {support_size}",
+                fmt=look.marker,
+                color=look.color,
+                markersize=3.5,
+                elinewidth=1.2,
+            )
             if printed:
-                look: Any = {
-                    "color": COLOURS[support_size].color,
-                    "linewidth": 0.8,
-                    "linestyle": ":",
-                }
-                axes.axvline(PRINTED_QMDP[support_size, COSTS[0]], **look)
+                at = PRINTED_QMDP[support_size, COSTS[0]]
+                axes.axvline(at, color=look.color, linewidth=0.8, linestyle=":")
         axes.set_yticks(range(len(rows)), [f"{border}, T_max {t_max}" for border, t_max in rows])
         # The first setting on top, as in the table.
         axes.invert_yaxis()
@@ -161,23 +137,13 @@ def _ranges(
         tidy(axes)
         legend(figure, axes)
 
-    under = f"under the paper's unstated settings, c = {settings[0].cost:g}"
+    under = f"under the paper's unstated settings, c = {COSTS[0]:g}"
     dotted = "; dotted: the printed values" if printed else ""
     title = f"{label} {under}: median and range, n = {len(DRAWS)} draws{dotted}"
     columns = [*map(Column, ("border", "T_max", "Z")), *_spread_columns(2)]
-    numbers: Rows = [[s.border, s.t_max, s.support_size, *astuple(of(s))] for s in settings]
+    numbers: Rows = [[*s[:3], *getattr(s, name)] for s in settings]
     table = Table(f"sensitivity-{name}", title, columns, numbers)
     return draw_figure(table, 4.2, paint)
-
-
-def _draw_range(axes: Axes, spread: Array, y: ArrayLike, support_size: int) -> None:
-    """Medians with their ranges, `spread` `[3, settings]`, at the heights `y`."""
-    look, (middle, low, high) = COLOURS[support_size], spread
-    # `[2, settings]`, lengths below and above the median. The range, not a confidence interval: how far the draw of
-    # the kernel moves a figure.
-    bars = np.stack([middle - low, high - middle])
-    points: Any = {"fmt": look.marker, "color": look.color, "markersize": 3.5, "elinewidth": 1.2}
-    axes.errorbar(middle, y, xerr=bars, label=f"Z = {support_size}", **points)
 
 
 def sections(study: Study, openings: Openings) -> list[Section]:
@@ -195,24 +161,16 @@ def accuracy_table(study: Study, chosen: Pairs) -> Table:
     for (support_size, cost), world in sorted(
         chosen.items(), key=lambda item: (item[0][1], -item[0][0])
     ):
-        row: list[Cell] = [
-            support_size,
-            cost,
-            PRINTED_QMDP[support_size, cost],
-            100 * study.reference(world, "Q_MDP", "accuracy"),
-        ]
+        exact = 100 * study.reference(world, "Q_MDP", "accuracy")
+        row: list[Cell] = [support_size, cost, PRINTED_QMDP[support_size, cost], exact]
         row.append(PRINTED_TMDP[support_size, cost])
         for method in study.methods:
             values = [100 * run.figure("accuracy") for run in study.of(world, method)]
             row += [float(np.mean(values)) if values else None, len(values)]
         rows.append(row)
-    columns = [
-        Column("Z"),
-        Column("c", 2),
-        Column("Q_MDP, printed", 2, "%"),
-        Column("Q_MDP, exact", 2, "%"),
-    ]
-    columns.append(Column("TMDP, printed", 2, "%"))
+    columns = [Column("Z"), Column("c", 2)]
+    heads = ("Q_MDP, printed", "Q_MDP, exact", "TMDP, printed")
+    columns += [Column(head, 2, "%") for head in heads]
     for method in study.methods:
         columns += [Column(method, 2, "%"), Column(f"n, {method}")]
     return Table(
@@ -243,8 +201,7 @@ def _worlds(openings: Openings) -> Section:
     rule = words["rule"].format(
         first=first, last=last, t_max=calibration.T_MAX, border=calibration.BORDER
     )
-    drawn = sensitivity_figures(openings.settings)
-    figure = calibration_figure(openings.candidates)
+    figure, drawn = calibration_figure(openings.candidates), sensitivity_figures(openings.settings)
     parts: list[Part] = [f"<p>{rule}</p>", [figure], f"<p>{fit}</p>", best, drawn]
     tables = [candidates_table(openings.candidates), sensitivity_table(openings.settings)]
     return Section("worlds", "The paper's worlds, calibrated", parts, tables)
@@ -252,12 +209,12 @@ def _worlds(openings: Openings) -> Section:
 
 def _critique(study: Study, chosen: Pairs, openings: Openings) -> Section:
     bounds = bounds_table(study, chosen)
-    text = _points(study, bounds, chosen, openings.checks)
-    return Section(
-        "critique",
-        "Where the paper is silent or wrong",
-        [text, bounds, checks_table(openings.checks)],
-    )
+    parts: list[Part] = [
+        _points(bounds.rows, openings.checks),
+        bounds,
+        checks_table(openings.checks),
+    ]
+    return Section("critique", "Where the paper is silent or wrong", parts)
 
 
 def checks_table(found: Iterable[Check]) -> Table:
@@ -266,7 +223,7 @@ def checks_table(found: Iterable[Check]) -> Table:
         [
             c.name,
             c.statement,
-            None if c.deviation == float("-inf") else f"{c.deviation:.1e}",
+            None if c.deviation == NO_CASE else f"{c.deviation:.1e}",
             c.verdict,
             c.note,
         ]
@@ -295,56 +252,42 @@ def bounds_table(study: Study, pairs: Pairs) -> Table:
         simple = study.reference(world, "Q_MDP", "aihtr")
         row: list[Cell] = [support_size, cost, simple, best, upper, proved]
         rows.append([*row, clocked, valid, printed, below])
-    columns = [Column("Z"), Column("c", 2), Column("Q_MDP", 3), Column("optimum, attained", 4)]
-    columns += [
-        Column("optimum, at most", 4),
-        Column("proved"),
-        Column("clocked bound", 3),
-        Column("valid bound", 3),
-    ]
-    columns += [Column("printed bound", 3), Column("printed bound is exceeded")]
-    return Table(
-        "bounds",
-        "AIHTR: Q_MDP, the proved bracket of the optimum, and the bounds, exactly",
-        columns,
-        rows,
-    )
+    columns = [Column("Z"), Column("c", 2), Column("Q_MDP", 3)]
+    columns += [Column("optimum, attained", 4), Column("optimum, at most", 4), Column("proved")]
+    columns += [Column(f"{kind} bound", 3) for kind in ("clocked", "valid", "printed")]
+    columns.append(Column("printed bound is exceeded"))
+    caption = "AIHTR: Q_MDP, the proved bracket of the optimum, and the bounds, exactly"
+    return Table("bounds", caption, columns, rows)
 
 
-def _points(study: Study, table: Table, pairs: Pairs, found: Sequence[Check]) -> str:
-    """The headings and paragraphs of `critique.txt`, in the order of the paper, with the figures of this sweep."""
-    forms = ("as printed", "exact form")
-    printed, exact = (
-        next(each for each in found if each.name == f"Theorem 3, {form}") for form in forms
-    )
-    facts = (
-        _exit_price(table, found) | {"printed": printed, "exact": exact} | _hardest(study, pairs)
-    )
-    points = (
-        (head, text.format(**facts))
-        for head, text in paragraphs("trackmdp.paper", "critique.txt").items()
-    )
-    return "".join(
-        f"<h3>{html.escape(head)}</h3><p>{html.escape(body)}</p>" for head, body in points
-    )
+def _points(bounds: Sequence[Sequence[Any]], found: Iterable[Check]) -> str:
+    """The headings and paragraphs of `critique.txt`, in the order of the paper, with the figures of this sweep.
 
-
-def _exit_price(table: Table, found: Sequence[Check]) -> dict[str, Any]:
-    exceeded = [f"(Z = {row[0]}, c = {row[1]:g})" for row in table.rows if row[-1]]
-    remark = next((check.note for check in found if check.name == "the printed bound"), "")
-    where = ", ".join(exceeded) or "none"
-    return {"exceeded": len(exceeded), "pairs": len(table.rows), "where": where, "remark": remark}
-
-
-def _hardest(study: Study, pairs: Pairs) -> dict[str, Any]:
-    """How tight the clocked bound is, and where it is not attained."""
-    short = {}
-    for (support_size, cost), world in pairs.items():
-        bound, best = study.reference(world, "clocked bound", "aihtr"), study.best(world)
+    Args:
+        bounds: rows of `bounds_table`.
+        found: the statements checked.
+    """
+    exceeded, short = [], []
+    for z, cost, _, best, _, _, clocked, *_, below in bounds:
+        if below:
+            exceeded.append(f"(Z = {z}, c = {cost:g})")
         # U is the optimum where its policy leaves at most one cell of positive probability unsensed; elsewhere the
         # optimum takes a search, and may lie below.
-        if bound - best > 1e-6 * max(1.0, abs(bound)):
-            short[f"Z = {support_size}, c = {cost:g}"] = bound - best
-    missed = "; ".join(f"{pair} ({gap:.3f} missing)" for pair, gap in short.items())
-    rest = f", by none that is known in {missed}" if missed else ""
-    return {"attained": len(pairs) - len(short), "rest": rest}
+        if clocked - best > 1e-6 * max(1.0, abs(clocked)):
+            short.append(f"Z = {z}, c = {cost:g} ({clocked - best:.3f} missing)")
+    named = {check.name: check for check in found}
+    facts = {
+        "exceeded": len(exceeded),
+        "pairs": len(bounds),
+        "where": ", ".join(exceeded) or "none",
+        "remark": named["the printed bound"].note,
+        "printed": named["Theorem 3, as printed"],
+        "exact": named["Theorem 3, exact form"],
+        "attained": len(bounds) - len(short),
+        "rest": f", by none that is known in {'; '.join(short)}" if short else "",
+    }
+    points = paragraphs("trackmdp.paper", "critique.txt").items()
+    return "".join(
+        f"<h3>{html.escape(head)}</h3><p>{html.escape(text.format(**facts))}</p>"
+        for head, text in points
+    )

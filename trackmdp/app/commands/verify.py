@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +59,7 @@ def write_checks(world: World, tolerance: float, folder: Path) -> list[Check]:
         },
         "tolerance": tolerance,
         "checks": [
-            asdict(check) | {"verdict": check.verdict, "passed": check.passed} for check in checks
+            check._asdict() | {"verdict": check.verdict, "passed": check.passed} for check in checks
         ],
     }
     write_json(folder / "verification.json", content)
