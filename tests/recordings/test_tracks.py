@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 from tests.helpers import small_world
 from tests.tracks import by_hand, digest_of, drawn, write
+from trackmdp.arrays.files import once
 from trackmdp.errors import UserError
-from trackmdp.recordings.tracks import Tracks, check_tracks, read_tracks, split
+from trackmdp.recordings.tracks import Tracks, read_tracks, split
 
 
 def same(one: Tracks, other: Tracks) -> bool:
@@ -66,9 +67,10 @@ def test_a_file_that_has_changed_is_read_again(tmp_path: Path) -> None:
         file.unlink(missing_ok=True)
         file.write_text(f"track,cell\n0,{cell}\n")
         os.utime(file, ns=(cell, cell))
-        assert read_tracks(file, 3, exits=True).cells.tolist() == [cell]
-        assert read_tracks(file, 3, exits=True) is read_tracks(file, 3, exits=True)
-        assert not read_tracks(file, 3, exits=False).exits.any()
+        found = once(read_tracks, file, 3, True)
+        assert found.cells.tolist() == [cell]
+        assert once(read_tracks, file, 3, True) is found
+        assert not once(read_tracks, file, 3, False).exits.any()
 
 
 @pytest.mark.parametrize(
@@ -142,14 +144,14 @@ def test_files_that_are_no_columns_are_refused(tmp_path: Path) -> None:
 
 
 def test_short_tracks_are_refused(tmp_path: Path) -> None:
-    tracks = by_hand([0, 1, 2], [0, 1], [0], [0, 1, 2, 3])
-    assert check_tracks(tracks, 1, "x") is tracks
-    with pytest.raises(UserError, match=r"^x: track 2 has 1 cells, expected at least 2$"):
-        check_tracks(tracks, 2, "x")
-    with pytest.raises(
-        UserError, match=r"^x: track 0 has 3 cells, expected at least 4 \(3 of 4 are too short\)$"
+    file = write(tmp_path / "x.csv", by_hand([0, 1, 2], [0, 1], [0], [0, 1, 2, 3]))
+    assert len(read_tracks(file, 3, exits=True)) == 4
+    for shortest, message in (
+        (2, r"track 2 has 1 cells, expected at least 2 \(1 of 4 are too short\)$"),
+        (4, r"track 0 has 3 cells, expected at least 4 \(3 of 4 are too short\)$"),
     ):
-        check_tracks(tracks, 4, "x")
+        with pytest.raises(UserError, match=message):
+            read_tracks(file, 3, exits=True, shortest=shortest)
     (tmp_path / "t.csv").write_text("track,cell\nbus 7,3\nbus 12,0\nbus 12,1\n")
     with pytest.raises(UserError, match="track bus 7 has 1 cells, expected at least 2"):
         read_tracks(tmp_path / "t.csv", 3, exits=True, shortest=2)

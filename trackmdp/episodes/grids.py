@@ -71,13 +71,12 @@ def grid_messages(
     rows, columns = size
     exited = (episode.target == rows * columns).astype(int).tolist()
     at = np.stack(np.divmod(episode.target % (rows * columns), columns), axis=1).tolist()
-    layers = _layers(episode, size, episode.action if covered is None else covered)
-    steps = enumerate(zip(layers, at, _parts(episode, size), strict=True))
-    for t, ((cells, active), (row, column), (y, x)) in steps:
-        stamp = stamp_of(first_tick + t)
+    layers, parts = _layers(episode, size, covered), _parts(episode, size)
+    for t, (cells, box, active, around) in enumerate(layers):
+        stamp, (row, column), (y, x) = stamp_of(first_tick + t), at[t], parts[t]
         yield {
-            "/grid": boxed(stamp, _GRID_SAYS, *cells, 0),
-            "/active": boxed(stamp, _ACTIVE_SAYS, *active, 0.01),
+            "/grid": boxed(stamp, _GRID_SAYS, cells, box, 0),
+            "/active": boxed(stamp, _ACTIVE_SAYS, active, around, 0.01),
             # half as wide as its cell, so that the layers beneath it show: in column 3 from x = 3.25 to 3.75
             "/target": grid_text(
                 stamp, _TARGET_SAYS, _DOT[exited[t]], column + 0.25, rows - row - 0.75, 0.02
@@ -86,29 +85,24 @@ def grid_messages(
         }
 
 
-_Layer: TypeAlias = tuple[AnyArray, Box]
-
-
 def _layers(
-    episode: Episode, size: tuple[int, int], active: BoolArray
-) -> Iterator[tuple[_Layer, _Layer]]:
+    episode: Episode, size: tuple[int, int], covered: BoolArray | None
+) -> Iterator[tuple[AnyArray, Box, AnyArray, Box]]:
     """Of each step belief and policy `[R, C]`, and the cells sensed, each with the box to be written."""
     # A few steps at a time: of all steps together they would take 12 bytes for each step and cell.
-    each = max(1, _AT_ONCE // math.prod(size))
+    each, active = (
+        max(1, _AT_ONCE // math.prod(size)),
+        episode.action if covered is None else covered,
+    )
     for begin in range(0, len(episode), each):
         some = slice(begin, begin + each)
         sensed = active[some].reshape(-1, *size)
         cells = np.zeros(sensed.shape, _CELL)
         cells["belief"] = episode.belief[some].reshape(cells.shape)
         cells["policy"] = episode.probability[some].reshape(cells.shape)
-        whole = np.broadcast_to(True, cells.shape)
-        used = (cells["belief"] > 0) | (cells["policy"] > 0)
-        boxes = boxes_of(whole if math.prod(size) <= WHOLE_CELLS else used)
-        yield from zip(
-            zip(cells, boxes, strict=True),
-            zip(sensed.view(np.uint8), boxes_of(sensed), strict=True),
-            strict=True,
-        )
+        used = (cells["belief"] > 0) | (cells["policy"] > 0) | (math.prod(size) <= WHOLE_CELLS)
+        active_cells = sensed.view(np.uint8)
+        yield from zip(cells, boxes_of(used), active_cells, boxes_of(sensed), strict=True)
 
 
 def stamp_of(tick: int) -> bytes:

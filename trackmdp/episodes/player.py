@@ -57,20 +57,17 @@ def frame(episode: Recording, t: int, task: Task) -> str:
     shades = np.array(list(_SHADES))[levels]
     marks = symbols(task.size, episode.target[t], on, found=episode.located[t], empty=shades)
     # Drawn around the targets, or around where they were before the last one left.
-    middle = (place // STEP * STEP + STEP // 2 for place in _middle(episode, [t, t - 1], task))
+    before = episode.target[t - 1] if t else episode.start
+    places = (np.atleast_1d(each) for each in (episode.target[t], before, episode.start))
+    inside = (each[each < task.num_cells] for each in places)
+    cells = next((each for each in inside if len(each)), np.atleast_1d(episode.start))
+    middle = (place // STEP * STEP + STEP // 2 for place in _amid(cells, task))
     parts = _parts(middle, task, WIDE)
     rows = [" ".join(row) for row in marks[np.ix_(*parts)]]
     edge = "─" * (2 * len(parts[1]) + 1)
     return "\n".join(
         [f"┌{edge}┐", *(f"│ {row} │" for row in rows), f"└{edge}┘", *_cut(task, parts)]
     )
-
-
-def _middle(episode: Recording, steps: Iterable[int], task: Task) -> tuple[int, int]:
-    """Row and column amid the targets at the first of `steps` at which one is in the grid, or of their start."""
-    cells = (np.atleast_1d(episode.target[t] if t >= 0 else episode.start) for t in steps)
-    inside = (each[each < task.num_cells] for each in cells)
-    return _amid(next((each for each in inside if len(each)), np.atleast_1d(episode.start)), task)
 
 
 def _amid(cells: IndexArray, task: Task) -> tuple[int, int]:

@@ -129,7 +129,7 @@ def read_track_file(
         )
     if kind == "cells":
         place = _place_of_cells(own, source)
-        tracks = read_tracks(path, size, exits=exits, shortest=shortest)
+        tracks = once(read_tracks, path, size, exits, shortest)
         return split(tracks, *draw), {}, place
     for option, expected in (
         ("kernel.step", "seconds from one cell to the next"),

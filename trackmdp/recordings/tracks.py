@@ -10,7 +10,7 @@ from typing import Unpack
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.files import once, read_columns
+from trackmdp.arrays.files import read_columns
 from trackmdp.arrays.types import Array, BoolArray, Indices
 from trackmdp.errors import UserError
 from trackmdp.grid.size import Size, grid_size
@@ -196,7 +196,7 @@ class Recorded(Task):
         return replace(self, held_out=self.validation)
 
 
-def read_tracks(path: str | Path, size: Size, *, exits: bool, shortest: int = 1) -> Tracks:
+def read_tracks(path: str | Path, size: Size, exits: bool, shortest: int = 1) -> Tracks:
     """Read tracks from a .csv file with a header line, or from arrays of the same names in an .npz file.
 
     The columns are `track` (an integer or a text, the same for all steps of a track; texts are numbered in sorted
@@ -213,18 +213,13 @@ def read_tracks(path: str | Path, size: Size, *, exits: bool, shortest: int = 1)
         UserError: the file is not of that form, a cell lies outside the grid, a step is missing or there twice, or a
             track is too short.
     """
-    return once(_read, path, grid_size(size), exits, shortest)
-
-
-def _read(path: str | Path, size: tuple[int, int], exits: bool, shortest: int) -> Tracks:
-    """See `read_tracks`."""
     source, (columns, texts) = f"kernel.path={path}", read_columns("kernel.path", path, ids="track")
     if set(columns) - {"step"} not in _COLUMNS:
         raise UserError(f"{source}: columns {', '.join(columns)}, expected {_FORMAT}")
     if not len(columns["track"]):
         raise UserError(f"{source}: no tracks, expected at least two")
     numbers = {name: _integers(source, name, column) for name, column in columns.items()}
-    track, cell = numbers["track"], _cells(source, numbers, size)
+    track, cell = numbers["track"], _cells(source, numbers, grid_size(size))
     # Last key first: by track, then by step. Without steps the sort is stable, so that the file's order stays.
     order = np.lexsort((numbers.get("step", np.zeros_like(track)), track))
     track, cell = track[order], cell[order]
@@ -234,25 +229,14 @@ def _read(path: str | Path, size: tuple[int, int], exits: bool, shortest: int) -
         step = numbers["step"][order]
         _check_steps(source, track, step, texts)
         begins = step[first[:-1]] - step.min()
-    made = Tracks(cell, first, np.full(len(names), exits), names, begins)
-    return check_tracks(made, shortest, source, texts)
-
-
-def check_tracks(tracks: Tracks, shortest: int, source: str, texts: Sequence[str] = ()) -> Tracks:
-    """Return `tracks` if each has at least `shortest` cells; `texts` are their ids where these are no numbers.
-
-    Raises:
-        UserError: one has fewer.
-    """
-    short = tracks.lengths < shortest
-    if short.any():
-        first = int(np.flatnonzero(short)[0])
-        others = f" ({short.sum()} of {len(tracks)} are too short)" if short.sum() > 1 else ""
-        name = texts[first] if texts else tracks.names[first]
+    short = np.flatnonzero(lengths < shortest)
+    if len(short):
+        name = texts[short[0]] if texts else names[short[0]]
         raise UserError(
-            f"{source}: track {name} has {tracks.lengths[first]} cells, expected at least {shortest}{others}"
+            f"{source}: track {name} has {lengths[short[0]]} cells, expected at least {shortest} "
+            f"({len(short)} of {len(names)} are too short)"
         )
-    return tracks
+    return Tracks(cell, first, np.full(len(names), exits), names, begins)
 
 
 def split(
