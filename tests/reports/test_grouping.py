@@ -109,7 +109,7 @@ def test_regret_is_to_the_best_upper_bound_that_any_run_of_the_world_has_proved(
     ]
     found = study(runs)
     (world,) = found.worlds
-    assert (found.upper(world), found.lower(world)) == (99.5, 99.2)
+    assert (found.upper(world), found.best(world)) == (99.5, 99.2)
     assert found.regrets("model_based") == [pytest.approx([9.5 / 200, 0.5 / 200])]
     assert found.bracket(world) == pytest.approx(0.3 / 200)  # 99.2 is attained, 99.5 may be
     table = runs_table(found)

@@ -159,9 +159,9 @@ def test_the_printed_bound_is_shown_to_be_none(report: Report, results: Results)
     grouped = study(results.runs)
     table = next(table for table in report.tables if table.name == "bounds")
     for row, (_, world) in zip(table.rows, pairs(grouped).items(), strict=True):
-        run = grouped.in_world(world)[0]
+        run = grouped.of(world)[0]
         printed = run.references["printed bound"]["aihtr"]
-        assert printed is not None and row[-1] == ((grouped.lower(world) or 0.0) > printed)
+        assert printed is not None and row[-1] == (grouped.best(world) > printed)
     assert "bound 41.93, a policy attains 42.56" in report.html()
 
 

@@ -49,9 +49,7 @@ def test_its_kernels_are_those_of_the_rule(grouped: Study) -> None:
     assert known
     seeds = chosen(known.candidates)
     for (support_size, _), world in pairs(grouped).items():
-        assert {run.settings["kernel.seed"] for run in grouped.in_world(world)} == {
-            seeds[support_size]
-        }
+        assert {run.settings["kernel.seed"] for run in grouped.of(world)} == {seeds[support_size]}
 
 
 def test_the_default_comes_close_in_every_pair_and_a2c_is_above_qmdp(grouped: Study) -> None:
@@ -70,7 +68,7 @@ def test_a_sweep_of_some_of_the_paper_s_worlds_is_not_taken_for_the_paper_s(
     results = load_results(KEPT)
     wanted = ("Z=5, c=0.16", "Z=3, c=0.16")
     grouped = study(results.runs)
-    some = [run for world in grouped.worlds if world in wanted for run in grouped.in_world(world)]
+    some = [run for world in grouped.worlds if world in wanted for run in grouped.of(world)]
     assert some
     part = tmp_path / "part"
     part.mkdir()

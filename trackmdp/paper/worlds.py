@@ -76,7 +76,7 @@ def pairs(study: Study) -> Pairs:
     """
     found: dict[tuple[int, float], str] = {}
     for world in study.worlds:
-        runs = study.in_world(world)
+        runs = study.of(world)
         settings = runs[0].settings
         pair: Any = settings.get("kernel.support_size"), settings.get("cost.sensor")
         # T_max, border and seed of the kernel are not compared: the paper does not give them.
@@ -84,6 +84,6 @@ def pairs(study: Study) -> Pairs:
         # A list, as prices may be a list, which has no hash.
         if other or settings.get("targets.count", 1) != 1 or pair not in [*PRINTED_QMDP]:
             continue
-        if pair not in found or len(study.in_world(found[pair])) < len(runs):
+        if pair not in found or len(study.of(found[pair])) < len(runs):
             found[pair] = world
     return dict(sorted(found.items()))

@@ -117,7 +117,7 @@ def panels(study: Study) -> list[Panel]:
     """Panels of at least two worlds."""
     groups: dict[str, dict[float, str]] = {}
     for world in study.worlds:
-        price = study.in_world(world)[0].settings.get("cost.sensor")
+        price = study.of(world)[0].settings.get("cost.sensor")
         if isinstance(price, (int, float)):
             # The worlds of a panel share the label without its price; a name may have a later part like it.
             parts = world.split(", ")
@@ -234,7 +234,7 @@ def late_learners(study: Study) -> dict[str, float]:
         curves = [curve[:, 1] for group in _curves(study, method, 0) for curve in group]
         flat = [len(y) < 3 or (y[-2] > 0.9 * y[0] and y[-1] < 0.5 * y[0]) for y in curves]
         if curves and all(flat):
-            found[method] = max(run.figure("frames") for run in study.by_method(method))
+            found[method] = max(run.figure("frames") for run in study.of(method=method))
     return found
 
 

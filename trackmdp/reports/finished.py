@@ -72,26 +72,23 @@ def _references(summary: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Figures of other policies and bounds in the same world; on recordings those on the held-out tracks."""
     if several := summary.get("several"):
         # Q_MDP and fixed sets are of a single target.
-        merged, known = several["merged_optimum"], dict[str, dict[str, Any]]()
-        known |= {"best known": _together(merged)} if merged else {}
+        policies = {"best known": _together(several["merged_optimum"] or {})}
         alone = {"separate trackers": several["apart"], "clocked bound": several["upper"]}
-        return known | {name: {"aihtr": end} for name, end in alone.items() if end is not None}
-    if held_out := summary.get("held_out"):
+    elif held_out := summary.get("held_out"):
         return {
             name: {key: figures[own]["mean"] for key, own in _TRACKED.items()}
             for name, figures in held_out["figures"].items()
             if name != "policy"
         }
-    policies = {"Q_MDP": summary["qmdp"], **summary.get("references", {})}
+    else:
+        policies = {"Q_MDP": summary["qmdp"], **summary.get("references", {})}
+        alone = {name: summary["bounds"].get(key) for name, key in _BOUNDS.items()}
     found = {
         name: {key: each.get(key) for key in _TRACKED.values()}
         for name, each in policies.items()
         if each
     }
-    bounds_known = {name: summary["bounds"].get(key) for name, key in _BOUNDS.items()}
-    return found | {
-        name: {"aihtr": value} for name, value in bounds_known.items() if value is not None
-    }
+    return found | {name: {"aihtr": value} for name, value in alone.items() if value is not None}
 
 
 def _together(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 from trackmdp.reports.results import FinishedRun
@@ -25,8 +27,10 @@ _WORLD = ("grid.", "kernel.", "cost.", "sensor.", "targets.count")
 _KNOWLEDGE = "kernel.homogeneous"
 """An option of the kernel that only the learner reads."""
 # Options of no effect on the learned policy, or of its draw.
-_IGNORED = ("seed", "quiet", "device", "threads", "resume", "init_from")
-_IGNORED_GROUPS = ("log.", "checkpoint.", "evaluation.", "optimal.")
+_IGNORED = (
+    *("seed", "quiet", "device", "threads", "resume", "init_from"),
+    *("log.", "checkpoint.", "evaluation.", "optimal."),
+)
 
 Options = Mapping[str, Any]
 
@@ -45,38 +49,24 @@ class Study:
     methods: Sequence[str]
     groups: Mapping[tuple[str, str], Sequence[FinishedRun]]
 
-    def of(self, world: str, method: str) -> Sequence[FinishedRun]:
-        """Runs of a method in a world, one per seed."""
-        return self.groups.get((world, method), ())
-
-    def in_world(self, world: str) -> list[FinishedRun]:
-        """All runs in a world."""
-        return [run for method in self.methods for run in self.of(world, method)]
-
-    def by_method(self, method: str) -> list[FinishedRun]:
-        """All runs of a method."""
-        return [run for world in self.worlds for run in self.of(world, method)]
+    def of(self, world: str = "", method: str = "") -> list[FinishedRun]:
+        """All runs, or those in a world, of a method, or of both, which are ordered by seed."""
+        pairs = product([world] if world else self.worlds, [method] if method else self.methods)
+        return [run for pair in pairs for run in self.groups.get(pair, ())]
 
     @property
     def recorded(self) -> bool:
         """Whether some runs learned from recordings."""
-        return any(
-            "held_out_aihtr" in run.figures for group in self.groups.values() for run in group
-        )
+        return any("held_out_aihtr" in run.figures for run in self.of())
 
     @property
     def several(self) -> bool:
         """Whether some runs are of several targets."""
-        counts = (self.in_world(world)[0].settings.get("targets.count", 1) for world in self.worlds)
-        return any(count != 1 for count in counts)
+        return any(run.settings.get("targets.count", 1) != 1 for run in self.of())
 
     def references(self) -> list[str]:
         """Names of the policies and bounds that runs are compared with."""
-        return [
-            *dict.fromkeys(
-                name for group in self.groups.values() for run in group for name in run.references
-            )
-        ]
+        return [*dict.fromkeys(name for run in self.of() for name in run.references)]
 
     def title(self, reference: str) -> str:
         """The name of a policy or bound as it is shown: `best known` is the optimum where all brackets are closed."""
@@ -93,12 +83,11 @@ class Study:
 
     def regrets(self, method: str) -> list[list[float]]:
         """Regret per step of the runs of a method, by world; without worlds that have no bound."""
-        groups = [self.values(world, method, "regret") for world in self.worlds]
-        return [group for group in groups if group]
+        return [*filter(None, (self.values(world, method, "regret") for world in self.worlds))]
 
     def reference(self, world: str, name: str, key: str) -> float:
         """The same of another policy or bound in a world, the largest where runs differ."""
-        runs = self.in_world(world)
+        runs = self.of(world)
         if key == "regret":
             return self.regret(runs[0], world, self.reference(world, name, "aihtr"))
         found = (run.references.get(name, {}).get(key) for run in runs)
@@ -106,20 +95,15 @@ class Study:
 
     def upper(self, world: str) -> float:
         """Least proved upper bound on the AIHTR in a world; nan on recordings."""
-        proved = [run.figure("optimal_upper") for run in self.in_world(world)]
-        return min(
-            _known([*proved, self.reference(world, "clocked bound", "aihtr")]), default=math.nan
-        )
-
-    def lower(self, world: str) -> float | None:
-        """Best AIHTR of a policy of the solver in a world."""
-        found = (run.figure("optimal_lower") for run in self.in_world(world))
-        return max(_known(found), default=None)
+        proved = [run.figure("optimal_upper") for run in self.of(world)]
+        clocked = self.reference(world, "clocked bound", "aihtr")
+        return min(_known([*proved, clocked]), default=math.nan)
 
     def best(self, world: str) -> float:
-        """AIHTR of the best policy known in a world."""
-        learned = [run.figure("aihtr") for run in self.in_world(world)]
-        return max(_known([*learned, self.lower(world), self.reference(world, "Q_MDP", "aihtr")]))
+        """AIHTR of the best policy known in a world: of a run, of the solver, or Q_MDP."""
+        keys = ("aihtr", "optimal_lower")
+        found = [run.figure(key) for run in self.of(world) for key in keys]
+        return max(_known([*found, self.reference(world, "Q_MDP", "aihtr")]))
 
     def regret(self, run: FinishedRun, world: str, aihtr: float | None = None) -> float:
         """Distance per step from the best upper bound to the AIHTR of the run, or to `aihtr`; nan without a bound."""
@@ -134,7 +118,7 @@ class Study:
 
     def bracket(self, world: str) -> float:
         """Largest error per step of the regrets in a world: from the best policy known to the bound."""
-        return self.regret(self.in_world(world)[0], world, self.best(world))
+        return self.regret(self.of(world)[0], world, self.best(world))
 
 
 def _known(values: Iterable[float | None]) -> list[float]:
@@ -143,12 +127,12 @@ def _known(values: Iterable[float | None]) -> list[float]:
 
 def study(runs: Sequence[FinishedRun]) -> Study:
     """Group runs; a label names the options that differ between them."""
-    worlds = _labels(
-        runs, "kernel.name", _world_options, named=("kernel.support_size", "cost.sensor")
-    )
-    methods = _labels(runs, "algo.name", _method_options)
+    parts = {run.name: _parted(run.settings) for run in runs}
+    of_world, of_method = ({name: each[k] for name, each in parts.items()} for k in (0, 1))
+    worlds = _labels(of_world, "kernel.name", named=("kernel.support_size", "cost.sensor"))
+    methods = _labels(of_method, "algo.name")
     groups: dict[tuple[str, str], list[FinishedRun]] = {
-        (world, method): [] for world in worlds.values() for method in methods.values()
+        pair: [] for pair in product(worlds.values(), methods.values())
     }
     for run in sorted(runs, key=lambda run: (run.seed, run.name)):
         groups[worlds[run.name], methods[run.name]].append(run)
@@ -157,57 +141,45 @@ def study(runs: Sequence[FinishedRun]) -> Study:
     return Study([*dict.fromkeys(worlds.values())], [*dict.fromkeys(methods.values())], filled)
 
 
-def _of_world(key: str) -> bool:
-    return key.startswith(_WORLD) and key != _KNOWLEDGE
-
-
-def _world_options(run: FinishedRun) -> Options:
-    found = {key: value for key, value in run.settings.items() if _of_world(key)}
+def _parted(settings: Options) -> tuple[Options, Options]:
+    """Options of the world and of the method, those that set neither left out."""
     # The options with a short name first: of options that vary together the first one is named.
-    return {key: found[key] for key in SHORT if key in found} | found
+    world = {key: settings[key] for key in SHORT if key in settings}
+    method = {}
+    for key, value in settings.items():
+        if key.startswith(_WORLD) and key != _KNOWLEDGE:
+            world[key] = value
+        elif not key.startswith(_IGNORED):
+            method[key] = value
+    return world, method
 
 
-def _method_options(run: FinishedRun) -> Options:
-    return {
-        key: value
-        for key, value in run.settings.items()
-        if not _of_world(key) and key not in _IGNORED and not key.startswith(_IGNORED_GROUPS)
-    }
-
-
-def _labels(
-    runs: Sequence[FinishedRun],
-    head: str,
-    options: Callable[[FinishedRun], Options],
-    named: Sequence[str] = (),
-) -> dict[str, str]:
+def _labels(found: Mapping[str, Options], head: str, named: Sequence[str] = ()) -> dict[str, str]:
     """Name of each run -> label of its world or method, in the order of the labels.
 
     Options that differ, yet read alike, as two lists of prices do, are told apart by a number after the label.
 
     Args:
-        runs: all runs.
+        found: name of each run -> options of its world or method.
         head: option with the name of the kernel or the algorithm, which begins a label.
-        options: the options of the world or the method of a run.
         named: options that every label names, whether they differ or not.
     """
-    found = {run.name: options(run) for run in runs}
     keys = [*dict.fromkeys((*named, *_varied([*found.values()], head)))]
 
-    def order(run: FinishedRun) -> Any:
-        name = found[run.name][head]
+    def order(run: str) -> Any:
+        name = found[run][head]
         place = ORDER.index(name) if name in ORDER else len(ORDER)
-        return place, name, [_sortable(found[run.name].get(key)) for key in keys]
+        return place, name, [_sortable(found[run].get(key)) for key in keys]
 
     made: dict[str, str] = {}
     behind: dict[str, list[Any]] = {}  # label -> the different values that it stands for
-    for run in sorted(runs, key=order):
-        values = [found[run.name].get(key) for key in keys]
-        alike = behind.setdefault(label := _label(found[run.name], head, keys), [])
+    for run in sorted(found, key=order):
+        values = [found[run].get(key) for key in keys]
+        alike = behind.setdefault(label := _label(found[run], head, keys), [])
         if values not in alike:
             alike.append(values)
         place = alike.index(values)
-        made[run.name] = f"{label} ({place + 1})" if place else label
+        made[run] = f"{label} ({place + 1})" if place else label
     return made
 
 
@@ -240,7 +212,7 @@ def _sortable(value: Any) -> tuple[float, str]:
 
 
 def _short(key: str) -> str:
-    return SHORT.get(key) or key.removeprefix("algo.").removeprefix("kernel.").removeprefix("grid.")
+    return SHORT.get(key) or re.sub(r"^(algo|kernel|grid)\.", "", key)
 
 
 def _text(value: Any) -> str:

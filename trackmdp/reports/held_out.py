@@ -12,7 +12,7 @@ import numpy as np
 
 from trackmdp.arrays.types import Array
 from trackmdp.episodes.episode import Episode
-from trackmdp.notebook.card import counted_words
+from trackmdp.notebook.card import counted_words, span
 from trackmdp.recordings.gridding import said
 from trackmdp.recordings.tracks import Recorded
 from trackmdp.reports.page import Report, Section
@@ -86,9 +86,7 @@ def recorded_page(
 
 
 def _about(problem: Recorded, report: Mapping[str, Any]) -> str:
-    prices = " to ".join(
-        f"{each:g}" for each in np.unique([problem.cost.min(), problem.cost.max()])
-    )
+    prices = span(np.nanmin(problem.cost), np.nanmax(problem.cost))
     text = (
         f"{counted_words(report['tracks'], 'held-out track')}, {report['learned_from']:,} to learn from, "
         f"{report['validation']:,} to choose by; {problem.rows} x {problem.columns} cells, "

@@ -43,6 +43,11 @@ class Scene:
     target: int | None
     found: bool
 
+    @property
+    def cells(self) -> list[int]:
+        """Cells in which the target may be, or that are sensed."""
+        return np.flatnonzero((self.belief > 0) | self.on).tolist()  # type: ignore[no-any-return]
+
 
 def scenes(drawn: Mapped) -> list[Scene]:
     """The story from the cell with the likeliest miss that the next step makes good; empty without such a miss.
@@ -85,8 +90,7 @@ def idea_figure(drawn: Mapped) -> Figure | None:
     if not story:
         return None
     columns = drawn.size[1]
-    cells = np.flatnonzero(np.any([(scene.belief > 0) | scene.on for scene in story], axis=0))
-    row, column = np.divmod(cells, columns)
+    row, column = np.divmod([cell for scene in story for cell in scene.cells], columns)
     # Rows and columns of the part of the grid that is drawn: begin and end, which does not belong to it.
     part = [
         (max(int(each.min()) - _MARGIN, 0), min(int(each.max()) + _MARGIN + 1, length))
@@ -99,28 +103,25 @@ def idea_figure(drawn: Mapped) -> Figure | None:
 
     rows: Rows = [
         [
-            scene.title,
-            cell // columns + 1,
-            cell % columns + 1,
-            float(scene.belief[cell]),
-            bool(scene.on[cell]),
+            *(scene.title, cell // columns + 1, cell % columns + 1),
+            *(float(scene.belief[cell]), bool(scene.on[cell])),
         ]
         for scene in story
-        for cell in np.flatnonzero((scene.belief > 0) | scene.on).tolist()
+        for cell in scene.cells
     ]
-    heads = [Column("moment"), Column("row"), Column("column"), Column("probability", 3)]
+    heads = [*map(Column, ("moment", "row", "column")), Column("probability", 3), Column("sensed")]
     title = (
         "Shade: probability of the target. Frame: sensor on. Disc: target detected. Ring: missed. "
         f"{drawn.label}"
     )
-    return draw_figure(Table("story", title, [*heads, Column("sensed")], rows), 4.6, paint)
+    return draw_figure(Table("story", title, heads, rows), 4.6, paint)
 
 
 def _paint(axes: Axes, scene: Scene, columns: int, part: list[tuple[int, int]]) -> None:
     from matplotlib.patches import Rectangle
 
     (top, bottom), (left, right) = part
-    for cell in np.flatnonzero((scene.belief > 0) | scene.on).tolist():
+    for cell in scene.cells:
         row, column = divmod(cell, columns)
         # Shades by opacity, so that one colour of the page serves; the likeliest cell is the darkest.
         likely = float(scene.belief[cell] / scene.belief.max())

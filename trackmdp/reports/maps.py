@@ -57,13 +57,11 @@ def policy_map(name: str, drawn: Mapped) -> Figure:
     # A stored plan has a set for each n, also where that many misses cannot happen.
     sensed = [sets[n] * possible[n].any(axis=1, keepdims=True) for n in shown]
     # One size of tile for all, by the farthest cell drawn.
-    reach = max(
-        _farthest(can | (on > 0), drawn.size) for can, on in zip(possible, sensed, strict=False)
-    )
+    reach = _reach(np.any([*possible, *(on > 0 for on in sensed)], axis=0), drawn.size)
 
     def paint(figure: Canvas) -> None:
         for axes, n in zip(np.atleast_1d(figure.subplots(len(shown), 1)), shown, strict=True):
-            _draw_tiles(axes, sensed[n], possible[n], drawn.size, max(reach, 1))
+            _draw_tiles(axes, sensed[n], possible[n], drawn.size, reach)
             axes.set_title(_AFTER[n])
 
     if drawn.averaged:
@@ -178,11 +176,10 @@ def binned(values: Array, size: _Size) -> Array:
 
     150 rows and columns make tiles of 3 x 3 cells, 50 in each direction; the last ones may be cut off.
     """
-    begins = [np.arange(0, length, _side(size)) for length in size]
-    sums = np.add.reduceat(values.reshape(size), begins[0], axis=0)
-    sums = np.add.reduceat(sums, begins[1], axis=1)
-    rows, columns = (np.diff([*begin, length]) for begin, length in zip(begins, size, strict=True))
-    return sums / (rows[:, None] * columns)
+    row, column = np.indices(size).reshape(2, -1) // _side(size)
+    shape = int(row[-1]) + 1, int(column[-1]) + 1
+    tile = row * shape[1] + column
+    return (np.bincount(tile, values) / np.bincount(tile)).reshape(shape)
 
 
 def _draw_tiles(axes: Axes, on: Array, possible: BoolArray, size: _Size, reach: int) -> None:
@@ -230,9 +227,7 @@ def _squares(axes: Axes, colour: str, centre: Array, length: Array) -> None:
     axes.add_patch(PathPatch(path, facecolor=colour, edgecolor="none"))
 
 
-def _farthest(cells: BoolArray, size: _Size) -> int:
-    """Rows or columns from a located cell to its farthest one, at most 3: larger tiles are too small to see."""
-    (down, across), (row, column) = (np.divmod(each, size[1]) for each in np.nonzero(cells))
-    return min(
-        3, int(max(np.abs(down - row).max(initial=0), np.abs(across - column).max(initial=0)))
-    )
+def _reach(cells: BoolArray, size: _Size) -> int:
+    """Rows or columns from a located cell to its farthest one, 1 to 3: larger tiles are too small to see."""
+    located, other = (np.divmod(each, size[1]) for each in np.nonzero(cells))
+    return int(np.clip(np.abs(np.subtract(located, other)).max(initial=0), 1, 3))

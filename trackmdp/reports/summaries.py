@@ -50,7 +50,7 @@ def outcome_table(study: Study, threshold: float | None) -> Table:
         regrets = [regret for group in groups["regret"] for regret in group]
         cells = figure_cells({key: each.mean for key, each in means.items()})
         rest = [iqm(groups["regret"]), max(regrets, default=None), *_within(regrets, threshold)]
-        count = len(study.by_method(method))
+        count = len(study.of(method=method))
         rows.append([method, *cells, means["regret"].low, means["regret"].high, *rest, count])
     for name in study.references():
         if not name.endswith("bound"):  # a bound has neither accuracy nor sensors
@@ -84,7 +84,7 @@ def shortened(study: Study) -> list[str]:
     """Methods with fewer env steps than the options of the algorithm give them: ``ppo: 1,024,000 of 1,536,000``."""
     found = []
     for method in study.methods:
-        run = study.by_method(method)[0]
+        run = study.of(method=method)[0]
         try:
             shipped = compose("train", {"algo": run.algo, "grid.size": run.settings["grid.size"]})
         except UserError:  # an algorithm that is not installed here, or an older name

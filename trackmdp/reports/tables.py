@@ -101,24 +101,29 @@ class Table:
 
     def latex(self) -> str:
         """A `tabular` with horizontal rules; it needs no package."""
-        columns = [self.columns[place] for place in self._shown]
-        align = "".join("l" if self._texts[place] else "r" for place in self._shown)
-        head = " & ".join(rf"\textbf{{{_escape(column.heading)}}}" for column in columns)
+        align = "".join("l" if words else "r" for _, _, words in self._shown)
+        heads = (rf"\textbf{{{_escape(column.heading)}}}" for _, column, _ in self._shown)
         body = [
-            " & ".join(_escape(self.columns[place].text(row[place])) for place in self._shown)
+            " & ".join(_escape(column.text(row[place])) for place, column, _ in self._shown)
             for row in self.rows
         ]
         # In one line: the rest after a line break would be no comment.
         above = [f"% {' '.join(self.caption.split())}", rf"\begin{{tabular}}{{{align}}}"]
-        lines = [r"\hline", rf"{head} \\", r"\hline", *(rf"{line} \\" for line in body), r"\hline"]
+        lines = [
+            r"\hline",
+            rf"{' & '.join(heads)} \\",
+            r"\hline",
+            *(rf"{line} \\" for line in body),
+            r"\hline",
+        ]
         return "\n".join([*above, *lines, r"\end{tabular}", ""])
 
     def html(self) -> str:
         """A table with columns that sort when their heading is pressed."""
         heads = "".join(
-            f'<th scope="col"{self._side(place)}><button type="button">'
-            f"{html.escape(self.columns[place].heading)}</button></th>"
-            for place in self._shown
+            f'<th scope="col"{_side(words)}><button type="button">'
+            f"{html.escape(column.heading)}</button></th>"
+            for _, column, words in self._shown
         )
         rows = "\n".join(f"<tr>{self._cells(row)}</tr>" for row in self.rows)
         caption = html.escape(self.caption)
@@ -133,32 +138,28 @@ class Table:
 
     def _cells(self, row: Sequence[Cell]) -> str:
         cells = []
-        for place in self._shown:
-            value, text = row[place], html.escape(self.columns[place].text(row[place]))
-            number = isinstance(value, (int, float)) and not self._texts[place] and is_known(value)
+        for place, column, words in self._shown:
+            value, text = row[place], html.escape(column.text(row[place]))
+            number = isinstance(value, (int, float)) and not words and is_known(value)
             # The page sorts by the full number; the text is rounded and has separators.
             sort = f' data-v="{value!r}"' if number else ""
-            cells.append(f"<td{self._side(place)}{sort}>{text}</td>")
+            cells.append(f"<td{_side(words)}{sort}>{text}</td>")
         return "".join(cells)
 
-    def _side(self, place: int) -> str:
-        return "" if self._texts[place] else ' class="n"'
-
     @cached_property
-    def _known(self) -> list[list[Cell]]:
-        """Values of each column; made once, as every cell asks."""
-        places = range(len(self.columns))
-        return [[row[place] for row in self.rows if is_known(row[place])] for place in places]
+    def _shown(self) -> list[tuple[int, Column, bool]]:
+        """Place, column and whether it is one of words, of the columns with a value; of all where there are no rows."""
+        shown = []
+        for place, column in enumerate(self.columns):
+            known = [row[place] for row in self.rows if is_known(row[place])]
+            if known or not self.rows:
+                words = all(isinstance(value, (str, bool)) for value in known)
+                shown.append((place, column, words))
+        return shown
 
-    @cached_property
-    def _shown(self) -> list[int]:
-        """Places of the columns with a value; of all columns where there are no rows."""
-        return [place for place, values in enumerate(self._known) if values or not self.rows]
 
-    @cached_property
-    def _texts(self) -> list[bool]:
-        """Whether each column is one of words."""
-        return [all(isinstance(value, (str, bool)) for value in values) for values in self._known]
+def _side(words: bool) -> str:
+    return "" if words else ' class="n"'
 
 
 def _plain(value: Cell) -> Any:
