@@ -46,7 +46,7 @@ class Scene:
     @property
     def cells(self) -> list[int]:
         """Cells in which the target may be, or that are sensed."""
-        return np.flatnonzero((self.belief > 0) | self.on).tolist()  # type: ignore[no-any-return]
+        return np.flatnonzero((self.belief > 0) | self.on).tolist()
 
 
 def scenes(drawn: Mapped) -> list[Scene]:
