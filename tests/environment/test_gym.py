@@ -16,6 +16,7 @@ import trackmdp.gym
 from tests.helpers import hop_world, limited, small_world
 from tests.tracks import by_hand, recorded
 from trackmdp.environment.env import TrackEnv
+from trackmdp.environment.render import PICTURE_LEGEND
 from trackmdp.errors import UserError
 from trackmdp.world.group import Group
 from trackmdp.world.model import World
@@ -158,7 +159,7 @@ def test_an_unknown_option_is_a_type_error() -> None:
     ("options", "message"),
     [
         ({"world": WORLD, "size": 4}, "size: expected either a world, or options to make one of"),
-        ({"render_mode": "svg"}, "render_mode=svg: expected one of ansi, rgb_array"),
+        ({"render_mode": "svg"}, "render_mode=svg: expected one of ansi, human, rgb_array"),
         ({"size": 0}, "size=0"),
     ],
 )
@@ -166,3 +167,27 @@ def test_an_unknown_option_is_a_type_error() -> None:
 def test_what_is_wrong_is_one_line(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UserError, match=message):
         gymnasium.make(ID, **options)
+
+
+def test_a_human_sees_every_step(capsys: pytest.CaptureFixture[str]) -> None:
+    env = gymnasium.make(ID, world=WORLD, render_mode="human")
+    env.reset(seed=0)
+    env.step(np.ones(env.action_space.n, np.int8))
+    assert capsys.readouterr().out.count(PICTURE_LEGEND) == 2
+    assert env.render() is None
+
+
+def test_a_human_sees_the_step_at_an_episodes_end_once(capsys: pytest.CaptureFixture[str]) -> None:
+    envs = gymnasium.make_vec(
+        ID,
+        num_envs=2,
+        kernel="random_walk",
+        size=3,
+        exit_probability=0.9,
+        max_steps=2,
+        render_mode="human",
+    )
+    envs.reset(seed=0)
+    ended = [envs.step(np.ones(envs.action_space.shape, np.int8))[2:4] for _ in range(3)]
+    assert np.any(ended)
+    assert capsys.readouterr().out.count(PICTURE_LEGEND) == 4

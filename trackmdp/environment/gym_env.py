@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from inspect import signature
 from typing import Any, TypeAlias
 
@@ -23,7 +24,7 @@ from trackmdp.world.make import make_world
 from trackmdp.world.problem import Problem
 
 Observation: TypeAlias = dict[str, Any]
-_MODES = {"ansi": "text", "rgb_array": "rgb_array"}
+_MODES = {"ansi": "text", "human": "text", "rgb_array": "rgb_array"}
 
 
 class _Tracked:
@@ -79,13 +80,21 @@ class _Tracked:
         return {key: value if value.ndim else value[()] for key, value in seen.items()}
 
     def _info(self) -> dict[str, Any]:
-        """The true cells."""
+        """The true cells, asked for once at the end of each step, where a human sees its picture."""
+        if self.render_mode == "human":
+            self.render()
         target = self._env.target.numpy()
         return {"target": target if target.ndim else int(target)}
 
     def render(self) -> Any:
-        """The grid of the (first) target after the last step, in the render mode."""
-        return self.render_mode and self._env.render(_MODES[self.render_mode])
+        """The grid of the (first) target after the last step, in the render mode; "human" prints it at each step."""
+        if self.render_mode is None:
+            return None
+        picture = self._env.render(_MODES[self.render_mode])
+        if self.render_mode != "human":
+            return picture
+        sys.stdout.write(f"{picture}\n\n")
+        return None
 
 
 class TrackGym(_Tracked, gymnasium.Env[Observation, npt.NDArray[np.int8]]):
@@ -96,7 +105,7 @@ class TrackGym(_Tracked, gymnasium.Env[Observation, npt.NDArray[np.int8]]):
 
     Args:
         world: the world, recorded tracks or a group of targets; None to make one of `options`.
-        render_mode: "ansi" for text, "rgb_array" for pixels, or None.
+        render_mode: "ansi" for text, "human" to print it at each step, "rgb_array" for pixels, or None.
         options: options of `make_world`.
 
     Raises:
