@@ -24,9 +24,9 @@ def rows(
     A row without sweeps is the blocks' own plan. The last row of each block has the default halo, and the sweeps of
     exchange over the whole grid. All rows have the kernel and the price D of `words`.
     """
-    safe = world_of(words).safe_cost
+    world = world_of(words)
     for cost, misses in product(costs, t_max):
-        here = world_of(words, cost=cost, t_max=misses, safe_cost=safe)
+        here = world.but(cost=cost, t_max=misses)
         whole = tm.solve(here)
         length = whole.evaluation.expected_length
         widest = default_halo(here)

@@ -12,85 +12,76 @@ import trackmdp as tm
 
 Maker: TypeAlias = Callable[[], Any]
 """Makes a `World`."""
+Makers: TypeAlias = Callable[..., Maker]
+"""From the arguments of `make_world`, but for the size and T_max."""
 
 
 def worlds(size: int, t_max: int, named: Iterable[str] = ()) -> dict[str, Maker]:
     """Name -> maker of the worlds on `size` x `size` cells whose names contain one of `named`; all without `named`."""
-    make = _Makers(size, t_max)
-    found = _plain(make) | _priced(make) | _tables(make)
+    # A call such as `make("drift", cost=.2)` gives the maker of that world on this grid.
+    make = partial(partial, tm.make_world, size=size, t_max=t_max)
+    found = _plain(make) | _priced(make, size**2) | _tables(size, t_max)
     return {name: found[name] for name in found if not named or any(word in name for word in named)}
 
 
-class _Makers:
-    def __init__(self, size: int, t_max: int) -> None:
-        self.size, self.t_max = size, t_max
-
-    def kernel(self, kernel: str, cost: Any, **options: Any) -> Maker:
-        return partial(
-            tm.make_world, kernel, size=self.size, t_max=self.t_max, cost=cost, **options
-        )
-
-    def table(self, cost: float, seed: int, **options: Any) -> Maker:
-        return lambda: tm.World(
-            jumping(self.size, seed, **options), self.size, cost=cost, t_max=self.t_max
-        )
-
-
-def _plain(make: _Makers) -> dict[str, Maker]:
+def _plain(make: Makers) -> dict[str, Maker]:
     found: dict[str, Maker] = {}
     for p in (0.5, 0.6, 0.7):
         for c in (0.16, 0.22, 0.3):
-            found[f"drift {_text(p)} c {_text(c)}"] = make.kernel("drift", c, persistence=p)
+            found[f"drift {_text(p)} c {_text(c)}"] = make("drift", cost=c, persistence=p)
     for z, seed in ((3, 63), (4, 63), (5, 39)):  # as in experiment=paper
         for c in (0.16, 0.18, 0.2, 0.22):
-            found[f"paper Z {z} c {_text(c)}"] = make.kernel(
-                "random_support", c, support_size=z, seed=seed
+            found[f"paper Z {z} c {_text(c)}"] = make(
+                "random_support", cost=c, support_size=z, seed=seed
             )
     for c in (0.1, 0.2, 0.3, 0.4):
-        found[f"walk c {_text(c)}"] = make.kernel("random_walk", c)
+        found[f"walk c {_text(c)}"] = make("random_walk", cost=c)
     for c in (0.1, 0.2, 0.3):
-        found[f"diagonal c {_text(c)}"] = make.kernel("random_walk", c, diagonal=True)
+        found[f"diagonal c {_text(c)}"] = make("random_walk", cost=c, diagonal=True)
     return found | {
-        "support c .22": make.kernel("random_support", 0.22),
-        "support c .4": make.kernel("random_support", 0.4),
-        "Z 9 c .16": make.kernel("random_support", 0.16, support_size=9),
-        "radius 2 c .16": make.kernel("random_support", 0.16, radius=2),
-        "Z 9 radius 2 c .1": make.kernel("random_support", 0.1, support_size=9, radius=2),
+        "support c .22": make("random_support", cost=0.22),
+        "support c .4": make("random_support", cost=0.4),
+        "Z 9 c .16": make("random_support", cost=0.16, support_size=9),
+        "radius 2 c .16": make("random_support", cost=0.16, radius=2),
+        "Z 9 radius 2 c .1": make("random_support", cost=0.1, support_size=9, radius=2),
     }
 
 
-def _priced(make: _Makers) -> dict[str, Maker]:
+def _priced(make: Makers, cells: int) -> dict[str, Maker]:
     """Worlds with prices per cell, with other prices D of the safe action, and with a border that is an exit."""
-    cells = make.size**2
     rng = np.random.default_rng(1)
     uniform = rng.uniform(0.02, 0.5, cells).tolist()
     some_free = np.where(rng.random(cells) < 0.25, 0, 0.25).tolist()
     lognormal = np.minimum(0.2 * np.exp(0.8 * rng.standard_normal(cells)), 2).tolist()
     found: dict[str, Maker] = {}
     for safe in (0, 1, 1000):
-        found[f"D {safe} support c .22"] = make.kernel("random_support", 0.22, safe_cost=safe)
-        found[f"D {safe} drift .7 c .22"] = make.kernel("drift", 0.22, safe_cost=safe)
+        found[f"D {safe} support c .22"] = make("random_support", cost=0.22, safe_cost=safe)
+        found[f"D {safe} drift .7 c .22"] = make("drift", cost=0.22, safe_cost=safe)
     dear = {"safe_cost": 1000, "exit_probability": 0.001}
     return found | {
-        "exit border, drift .6 c .22": make.kernel("drift", 0.22, border="exit", persistence=0.6),
-        "exit border, walk c .3": make.kernel("random_walk", 0.3, border="exit"),
-        "prices .02-.5, drift .7": make.kernel("drift", uniform),
-        "prices .02-.5, support": make.kernel("random_support", uniform),
-        "quarter free, walk": make.kernel("random_walk", some_free),
-        "quarter free, drift .7": make.kernel("drift", some_free),
-        "lognormal prices, diagonal": make.kernel("random_walk", lognormal, diagonal=True),
-        "lognormal prices, support": make.kernel("random_support", lognormal),
-        "D 1000 support c .16 exit .001": make.kernel("random_support", 0.16, **dear),
-        "D 1000 drift .7 c .22 exit .001": make.kernel("drift", 0.22, **dear),
+        "exit border, drift .6 c .22": make("drift", cost=0.22, border="exit", persistence=0.6),
+        "exit border, walk c .3": make("random_walk", cost=0.3, border="exit"),
+        "prices .02-.5, drift .7": make("drift", cost=uniform),
+        "prices .02-.5, support": make("random_support", cost=uniform),
+        "quarter free, walk": make("random_walk", cost=some_free),
+        "quarter free, drift .7": make("drift", cost=some_free),
+        "lognormal prices, diagonal": make("random_walk", cost=lognormal, diagonal=True),
+        "lognormal prices, support": make("random_support", cost=lognormal),
+        "D 1000 support c .16 exit .001": make("random_support", cost=0.16, **dear),
+        "D 1000 drift .7 c .22 exit .001": make("drift", cost=0.22, **dear),
     }
 
 
-def _tables(make: _Makers) -> dict[str, Maker]:
+def _tables(size: int, t_max: int) -> dict[str, Maker]:
     near = {"reach": 1, "successors": 5}
+    tables: dict[str, tuple[float, int, dict[str, Any]]] = {
+        "far jumps": (0.2, 3, near | {"far": 3, "jumps": 0.3}),
+        "rare far jumps": (0.2, 4, near | {"far": 2, "jumps": 0.03}),
+        "20 successors c .08": (0.08, 5, {"reach": 2, "successors": 20}),
+    }
     return {
-        "far jumps": make.table(0.2, 3, **near, far=3, jumps=0.3),
-        "rare far jumps": make.table(0.2, 4, **near, far=2, jumps=0.03),
-        "20 successors c .08": make.table(0.08, 5, reach=2, successors=20),
+        name: partial(tm.World, jumping(size, seed, **options), size, cost=cost, t_max=t_max)
+        for name, (cost, seed, options) in tables.items()
     }
 
 

@@ -7,12 +7,14 @@ import inspect
 import json
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from typing import Any
 
 import trackmdp as tm
+from trackmdp.app.words import parsed
+from trackmdp.config.compose import compose
 from trackmdp.errors import UserError, output_of
 from trackmdp.training.devices import machine
+from trackmdp.world.make import build_world
 
 Row = dict[str, Any]
 PARTS = (
@@ -33,7 +35,6 @@ PARTS = (
     "values",
 )
 WORLD = ("grid.", "kernel", "cost.", "targets.")
-_RENAMED = {"cost.sensor": "cost", "cost.safe": "safe_cost", "targets.count": "targets"}
 _SHARED: Row = {"threads": 1, "out": ""}
 
 
@@ -113,32 +114,16 @@ def value_of(key: str, text: str, default: Any) -> Any:
         raise UserError(f"{key}={text}: expected {type(default).__name__}") from None
 
 
-def world_of(words: Mapping[str, str], **more: Any) -> Any:
-    """The world of words such as `grid.size=20` and `kernel=drift`; `more` are arguments of `make_world`.
+def world_of(words: Mapping[str, str]) -> Any:
+    """The world, or group of targets, of words such as `grid.size=20` and `kernel=drift`.
 
     Raises:
-        UserError: a word is unknown to `make_world`, or has a value out of range.
+        UserError: a word is unknown to `trackmdp solve`, or has a value out of range.
     """
-    given: Row = {}
-    for key, text in words.items():
-        name = _RENAMED.get(key, key.rpartition(".")[2])
-        if not key.startswith("kernel") and name not in inspect.signature(tm.make_world).parameters:
-            raise UserError(f"{key}: unknown, expected an option of trackmdp solve")
-        given[name] = _loaded(text)
-    try:
-        return tm.make_world(**{**given, **more})
-    except UserError as error:
-        # `make_world` names its argument, `sise`; the reader typed `kernel.sise`.
-        typed = f"kernel.{str(error).partition(':')[0]}"
-        raise UserError(f"kernel.{error}" if typed in words else str(error)) from None
-
-
-def _loaded(text: str) -> Any:
-    """JSON, a number in another form such as `.3`, or a name."""
-    for read in (json.loads, float):
-        with suppress(ValueError):
-            return read(text)
-    return text
+    given = {key: parsed(f"{key}={text}").value() for key, text in words.items()}
+    cfg = compose("solve", given)
+    world = build_world(cfg)
+    return world if cfg.targets.count == 1 else tm.Group([world] * cfg.targets.count)
 
 
 def as_words(words: Mapping[str, str]) -> list[str]:
