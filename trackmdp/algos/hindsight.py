@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import copy
 import math
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from scipy import sparse
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from trackmdp.algos.actor_loss import ActorLoss, Decision
 from trackmdp.algos.common import (
@@ -32,7 +31,7 @@ from trackmdp.algos.common import (
     set_learning_rate,
 )
 from trackmdp.algos.estimates.alike import cell_classes
-from trackmdp.algos.estimates.path_plans import choose_plan
+from trackmdp.algos.estimates.path_plans import Maker, choose_plan
 from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.algos.in_view import SensorsInView
 from trackmdp.algos.joint_trials import tried
@@ -43,6 +42,7 @@ from trackmdp.arrays.entries import ones_at
 from trackmdp.arrays.types import IndexArray
 from trackmdp.config.credit import PerSensorConfig
 from trackmdp.errors import UserError
+from trackmdp.grid.displacements import displacement
 from trackmdp.policies.acting import Exploring
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.table import PolicyTable
@@ -188,8 +188,8 @@ class Hindsight(Checkpointed):
         paths, judge = self._buffer.tracks(), self._buffer.judge
         assert judge is not None
         # No validation path was learned from.
-        starts = [PolicyTable(self.task, each) for each in (sets, learner.clocked_sets(self.task))]
-        others = [partial(_same, each) for each in starts]
+        starts = (PolicyTable(self.task, each) for each in (sets, learner.clocked_sets(self.task)))
+        others: list[Maker] = [lambda *_, start=start: start for start in starts]
         found = choose_plan(
             self.task, paths, priors=(), others=others, discount=_LATE_DISCOUNT, seed=judge
         )
@@ -240,11 +240,6 @@ class Hindsight(Checkpointed):
         return self._seen
 
 
-def _same(policy: PolicyTable, *_: object) -> PolicyTable:
-    """The policy, whatever the paths."""
-    return policy
-
-
 def _buffer(
     task: Task, capacity: int, rng: torch.Generator, judge: int | None
 ) -> MoveBuffer | SegmentBuffer:
@@ -262,29 +257,24 @@ def _classes(task: Task, cfg: PerSensorConfig) -> IndexArray | None:
     classes = cell_classes(cfg.share_cells, task.size)
     if classes is None:
         return None
-    alike = (
-        (
-            (task.cost == task.cost[0]).all(),
-            "sensors of different prices, expected one price for all",
-        ),
-        (
-            (task.detection == task.detection[0]).all(),
-            "sensors of different p_d, expected one for all",
-        ),
-        (task.coverage is None, "sensors with footprints, expected one in each cell"),
-    )
-    for fine, mistake in alike:
-        if not fine:
-            raise UserError(f"algo.share_cells={cfg.share_cells}: {mistake}")
+    task_of = {"prices": task.cost, "p_d": task.detection}
+    for name, each in task_of.items():
+        if not (each == each[0]).all():
+            raise UserError(
+                f"algo.share_cells={cfg.share_cells}: sensors of different {name}, expected one for all"
+            )
+    if task.coverage is not None:
+        raise UserError(
+            f"algo.share_cells={cfg.share_cells}: sensors with footprints, expected one in each cell"
+        )
     return classes
 
 
 def _distance(start: Tensor, end: Tensor, task: Task) -> Tensor:
     """How far moves go, in rows or in columns; 0 where they end outside, in M."""
-    columns, (start, end) = task.columns, (task.keys.cell(each) for each in (start, end))
-    moved = torch.maximum(
-        (start // columns - end // columns).abs(), (start % columns - end % columns).abs()
-    )
+    start, end = task.keys.cell(start), task.keys.cell(end)
+    down, across = displacement(task.columns, start, end)
+    moved = torch.maximum(down.abs(), across.abs())
     return moved.masked_fill_(end == task.num_cells, 0)
 
 
@@ -312,7 +302,7 @@ class _Learner(Checkpointed):
         set_learning_rate(self.optimizer, rate)
         self.optimizer.zero_grad()
         losses: dict[str, Tensor] = {}
-        for part in self.loss.parts(cells, self._on(), blend):
+        for part in self.loss.parts(cells, self._on(self.ema), blend):
             # Gradients add up over the parts; only one part's graph is in memory.
             torch.stack(list(part.values())).sum().backward()
             losses |= {name: loss.detach() + losses.get(name, 0.0) for name, loss in part.items()}
@@ -328,31 +318,27 @@ class _Learner(Checkpointed):
         return losses
 
     @torch.no_grad()
-    def _on(self) -> Tensor:
+    def _on(self, actor: nn.Module) -> Tensor:
         """`[M, T+1, K]`, the sensors on, as the actor's outputs."""
-        return torch.cat([self.ema(rows) > 0 for rows in self.loss.slices()])
+        return torch.cat([actor(rows) > 0 for rows in self.loss.slices()])
 
     def sets(self, task: Task) -> sparse.csr_array:
         """`[keys * (T+1), S]` bool, the policy's table."""
-        return _rows(task, self.loss.sensors, self._on())
+        return _rows(task, self.loss.sensors, self._on(self.ema))
 
-    @torch.no_grad()
     def clocked_sets(self, task: Task) -> sparse.csr_array:
         """The same of the clocked actor: the policy if the position were revealed after every action."""
-        loss = self.loss
-        on = torch.cat([loss.clocked_actor(rows) > 0 for rows in loss.slices()])
-        return _rows(task, loss.nearby, on)
+        return _rows(task, self.loss.nearby, self._on(self.loss.clocked_actor))
 
 
 def _rows(task: Task, sensors: SensorsInView, on: Tensor) -> sparse.csr_array:
     """`[keys * (T+1), S]` bool, from `on` `[keys, T+1, K]` of the sensors in view."""
-    # Entry (key, n, k) is sensor numbers[x, k], x the key's cell, in row key (T+1) + n of the table; `nonzero` lists
+    # Entry (key, n, k) is sensor numbers[key, k] in row key (T+1) + n of the table; `nonzero` lists
     # them row by row.
     key, n, local = on.nonzero(as_tuple=True)
-    cell = task.keys.cell(key)
     row, cell, column = (
         each.cpu().numpy()
-        for each in (key * task.num_choices + n, cell, sensors.numbers[cell, local])
+        for each in (key * task.num_choices + n, task.keys.cell(key), sensors.numbers[key, local])
     )
     there = choosable_places(task, cell, column)
     shape = (task.num_keys * task.num_choices, task.total_sensors)

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
@@ -48,13 +47,6 @@ class _Replayed:
     gain: Tensor
     target: Tensor
 
-    def of(self, chosen: slice | Tensor, first_row: int, first_entry: int) -> tuple[Tensor, ...]:
-        """Row, entry, alive and gain of the `chosen` paths, the places in tables that begin later."""
-        if isinstance(chosen, slice):
-            return self.row, self.entry, self.alive, self.gain
-        row, entry = self.row[:, chosen] - first_row, self.entry[:, chosen] - first_entry
-        return row, entry, self.alive[:, chosen], self.gain[:, chosen]
-
 
 class HindsightLoss(nn.Module):
     """Losses of the actor, the critic V and the clocked actor and critic, from fully sensed paths.
@@ -95,25 +87,28 @@ class HindsightLoss(nn.Module):
         # sensors that may see them, one in each where none has a footprint.
         choices, device = task.num_choices, generator.device
         self._task, self._generator = task, generator
-        self.reach, self._window, self._keys, self._classes = (
-            reach,
-            task.numbered,
-            task.keys,
-            task.keys.num_classes,
-        )
+        self.reach, self._keys, self._classes = reach, task.keys, task.keys.num_classes
         # One move takes the target to a cell that is near; t_max + 1 of them, to one in view.
-        self.near, self.view = (
-            Window.reaching(task, reach, device),
-            _in_view(task, choices * reach, device),
-        )
+        self.near = Window.reaching(task, reach, device)
+        self.view = _in_view(task, choices * reach, device)
         self.nearby, self.sensors = SensorsInView(task, self.near), SensorsInView(task, self.view)
+        # [M, C], the cells that are near each located one.
+        cells = self.near.cells.repeat_interleave(self._classes, dim=0)
+        self._near_cells = nn.Buffer(cells, persistent=False)
         self._make_nets(hidden, classes)
         actor_loss.allocate((task.num_keys, choices, self.sensors.width), device)
         self.actor_loss = actor_loss
         self.discount = discount
         entries = max(self.sensors.entries, self.near.width * self._keys.modes)
         self._keys_at_once = max(1, max_entries // (choices * entries))
-        self._keep_prices()
+        self.safe_cost = task.safe_cost / task.reward
+        # Reward of the forced step, in units of r: (r - D) / r; or about the sum of all until one locates.
+        safe = float(task.safe_detection.mean())
+        self._forced = (safe - self.safe_cost) / (1.0 - discount * (1.0 - safe))
+        # p_s [M + 1], known to the learner like the prices; 0 outside, and no state: it is the task's.
+        locates = torch.as_tensor(task.safe_detection, dtype=torch.float32, device=device)
+        every = pad(locates.repeat_interleave(self._classes), (0, 1))
+        self._safe_detection = None if task.safe else every
         self.clocks = nn.Buffer(torch.arange(choices, device=device).unsqueeze(-1))
         # Row 0 for the clocked actor, row 1 for the actor.
         self.gain_scale = nn.Buffer(torch.ones(2, choices, device=device))
@@ -122,13 +117,13 @@ class HindsightLoss(nn.Module):
         task, generator, choices = self._task, self._generator, self._task.num_choices
         # The border looks alike from two cells where it is equally far, or out of reach until the safe action; and so
         # must all classes of cells do that the target may come to before it.
-        # The sets are then learned once for both; values stay each cell's own.
+        # The sets are then learned once for both; values stay each cell's own. Keys of one group are of one class.
         groups = None
         if classes is not None:
-            groups = self._groups(
-                Window(task, choices * self.reach, generator.device),
-                torch.as_tensor(classes, device=generator.device),
-            )
+            window = Window(task, choices * self.reach, generator.device)
+            alike = window.groups(torch.as_tensor(classes, device=generator.device))
+            own = torch.arange(self._classes, device=alike.device)
+            groups = (alike.unsqueeze(1) * self._classes + own).flatten()
         net = partial(
             CellClockNet, task.num_keys, hidden=hidden, generator=generator, classes=self._classes
         )
@@ -142,40 +137,10 @@ class HindsightLoss(nn.Module):
 
         # U has T + 2 clocks: also n = T + 1, where the safe action is forced. V has a second one, L, only where that
         # may have to be repeated.
-        self.actor, self.critic = (
-            decisions(self.view, self.sensors),
-            net(1 if task.safe else 2, outputs=1),
-        )
-        self.clocked_actor, self.clocked_critic = (
-            decisions(self.near, self.nearby),
-            net(choices + 1, outputs=1),
-        )
-
-    def _keep_prices(self) -> None:
-        """Prices in units of r, and p_s."""
-        task, device = self._task, self._generator.device
-        self.safe_cost = task.safe_cost / task.reward
-        # Reward of the forced step, in units of r: (r - D) / r; or about the sum of all until one locates.
-        safe = float(task.safe_detection.mean())
-        self._forced = (safe - self.safe_cost) / (1.0 - self.discount * (1.0 - safe))
-        # A sensor that does not exist reports nothing, and is learned to be off by a price like the others'.
-        price = np.where(task.available, task.cost, np.nanmean(task.cost))
-        cost = torch.as_tensor(price / task.reward, dtype=torch.float32, device=device)
-        # [S + 1]: the last one, which there is none of, costs nothing, so that windows cut off by the border need no
-        # mask here.
-        self.cost = nn.Buffer(pad(cost, (0, 1)))
-        # p_s [M + 1], known to the learner like the prices; 0 outside, and no state: it is the task's.
-        locates = torch.as_tensor(task.safe_detection, dtype=torch.float32, device=device)
-        every = pad(locates.repeat_interleave(self._classes), (0, 1))
-        self._safe_detection = None if task.safe else every
-
-    def _groups(self, window: Window, alike: Tensor) -> Tensor:
-        """`[M]` the groups of located cells, or of keys: those of their cells and of one class."""
-        groups, classes = (
-            window.groups(alike).unsqueeze(1),
-            torch.arange(self._classes, device=self.view.cells.device),
-        )
-        return (groups * self._classes + classes).flatten()
+        self.actor = decisions(self.view, self.sensors)
+        self.critic = net(1 if task.safe else 2, outputs=1)
+        self.clocked_actor = decisions(self.near, self.nearby)
+        self.clocked_critic = net(choices + 1, outputs=1)
 
     def parts(self, cells: Tensor, on: Tensor, blend: float) -> Iterator[dict[str, Tensor]]:
         """The losses, a few located cells at a time; the critics' come with the last part.
@@ -188,7 +153,10 @@ class HindsightLoss(nn.Module):
             on: bool `[M, T+1, K]`, the sensors that the replayed policy switches on, as the actor's outputs.
             blend: λ of the gain.
         """
-        found = torch.cat([self.sensors.reports(on[rows], rows) for rows in self.slices()])
+        slices = self.slices()
+        found = torch.cat([self.sensors.reports(on[rows], rows) for rows in slices])
+        # C(A) [M, T + 1] of all sets.
+        paid = [(on[rows] * self.sensors.prices[rows].unsqueeze(1)).sum(-1) for rows in slices]
         replay = None
         if not self._task.markov:
             replay = Replay(self._task, self.view, found, self._generator)
@@ -197,19 +165,21 @@ class HindsightLoss(nn.Module):
         clocked, value = self._values()
         # [T + 1, M + 1], nothing gained by sensing an exited target. Detached: decisions do not train the values.
         advantage = pad(clocked_advantage(clocked.detach()), (0, 1))
-        plans = self._replay(replay, cells, own, (on, found), advantage, value.detach(), blend)
+        plans = self._replay(
+            replay, cells, own, (found, torch.cat(paid)), advantage, value.detach(), blend
+        )
         weights = (
             self._weights(0, *self._first_gains(cells[1], advantage)),
             self._weights(1, plans.alive.sum(1), plans.gain.abs().sum(1)),
         )
         # [M + 1, T + 2], U = 0 once exited.
         known, targets = pad(clocked.detach(), (0, 0, 0, 1)), []
-        for rows in (slices := self.slices()):
+        for rows in slices:
             chosen = self._paths_from(cells[0], rows)
             loss, target = self._clocked(cells[:2, chosen], rows, advantage, known)
-            actor_loss = self._own(
-                plans, rows, chosen if own is cells else self._paths_from(own[0], rows)
-            )
+            if own is not cells:
+                chosen = self._paths_from(own[0], rows)
+            actor_loss = self._own(plans, rows, chosen)
             targets.append(target)
             # The actor's rows are those of the policy's own plans, the clocked actor's every (x, n) that a move was
             # seen from.
@@ -232,16 +202,12 @@ class HindsightLoss(nn.Module):
     def slices(self) -> list[slice]:
         """The located cells, as many at once as `max_entries` allows."""
         m, step = self._keys.num_keys, self._keys_at_once
-        return (
-            [slice(begin, begin + step) for begin in range(0, m, step)]
-            if step < m
-            else [slice(None)]
-        )
+        return [slice(begin, min(begin + step, m)) for begin in range(0, m, step)]
 
     def _paths_from(self, start: Tensor, rows: slice) -> slice | Tensor:
         """Which paths start in the cells `rows`."""
-        if rows == slice(None):
-            return rows
+        if self._keys_at_once >= self._keys.num_keys:
+            return slice(None)
         return ((start >= rows.start) & (start < rows.stop)).nonzero().squeeze(1)
 
     def _first_gains(self, end: Tensor, advantage: Tensor) -> tuple[Tensor, Tensor]:
@@ -259,7 +225,7 @@ class HindsightLoss(nn.Module):
         Returns:
             The clocked actor's losses summed per clock, `[T+1]`, and the clocked critic's targets `[rows, T+2]`.
         """
-        nearby, logits = self._of_keys(self.near.cells, rows), self.clocked_actor(rows)
+        nearby, logits = self._near_cells[rows], self.clocked_actor(rows)
         k, h = nearby.shape[1], self._keys.modes
         ends = self._ends(nearby, rows)
         moved, visits = self._counted(moves, rows, len(nearby))
@@ -271,19 +237,13 @@ class HindsightLoss(nn.Module):
             part.unflatten(-1, (k, h)).sum(-1)
             for part in (gain.clamp(min=0), gain.clamp(max=0).neg())
         )
-        chosen, cost = (
-            logits.detach() > 0,
-            self.cost[self._of_keys(self.nearby.numbers, rows)].unsqueeze(1),
-        )
-        if self._window is not None and self._window < self.reach:
+        chosen, cost = logits.detach() > 0, self.nearby.prices[rows].unsqueeze(1)
+        window = self._task.numbered
+        if window is not None and window < self.reach:
             # Sensors outside the window cannot be chosen: they neither gain nor cost, nor are they learned about.
-            allowed = self._choosable(nearby, rows).unsqueeze(1)
-            chosen, plus, minus, cost = (
-                chosen & allowed,
-                plus * allowed,
-                minus * allowed,
-                cost * allowed,
-            )
+            allowed = self._choosable(window, rows).unsqueeze(1)
+            chosen, cost = chosen & allowed, cost * allowed
+            plus, minus = plus * allowed, minus * allowed
         # Each sensor on adds its gain, which turns gamma U(j, n + 1) into r + gamma U(j, 0), and takes its cost away.
         found = ((plus - minus) * self.nearby.reports(chosen, rows)).sum(-1)
         sensed = found, stays * (chosen * cost).sum(-1)
@@ -307,7 +267,7 @@ class HindsightLoss(nn.Module):
         Their quotient is the empirical kernel P_xj.
         """
         k, h, m = self.near.width, self._keys.modes, self._keys.num_keys
-        (start, end), first = moves, rows.start or 0
+        (start, end), first = moves, rows.start
         near = self.near.index(self._keys.cell(start), self._keys.cell(end))
         # Flat place in [rows, C H] of a move: with C = 9, H = 1, from cell 7 to its local cell 5 is 7 * 9 + 5 = 68;
         # where the slice begins at cell 4, 68 - 36 = 32. Exits have weight 0, wherever `index` puts them.
@@ -335,12 +295,6 @@ class HindsightLoss(nn.Module):
         found, spent = sensed
         return torch.cat([following[:, 1:] + found - spent, forced], dim=1)
 
-    def _of_keys(self, table: Tensor, rows: slice) -> Tensor:
-        """`[rows, K]`, the rows of a table `[cells, K]` for located cells, or for the cells of keys."""
-        if self._classes == 1:
-            return table[rows]
-        return table[torch.arange(self._keys.num_keys, device=table.device)[rows] // self._classes]
-
     def _replay(
         self,
         replay: Replay | None,
@@ -357,12 +311,12 @@ class HindsightLoss(nn.Module):
             replay: of a policy that remembers detections.
             cells: the paths.
             own: `[T+3, B]`, the key that the policy has at first, and those of a first detection at each later step.
-            policy: the sensors that it switches on, and the probability of a report in each cell in view.
+            policy: of each set the probability of a report in each cell in view, and its price.
             advantage: of detecting, the position being revealed after every action.
             value: V.
             blend: λ.
         """
-        (on, found), m = policy, self._keys.num_keys
+        (found, prices), m = policy, self._keys.num_keys
         # [B], [T + 2, B] and [T + 1, B]: the free choices are for the first T + 1 moves, the last one is the forced
         # step.
         start, moves = own[0], cells[1 : len(self.clocks) + 2]
@@ -371,9 +325,12 @@ class HindsightLoss(nn.Module):
         # [T + 1, B], the probability of a report; 0 or 1 with sensors that never miss.
         reports, inside = gather(found, entry) * seen.float(), moves < m
         # Set costs are computed once per (x, n) and looked up by the paths, however many there are.
-        prices = torch.cat([self._set_cost(on[rows], rows) for rows in self.slices()])
         spent = gather(prices, row)
-        located = self._located(replay, cells, own, prices, value[:, 0])
+        if replay is None:
+            located = gather(pad(value[:, 0], (0, 1)), own[1:])
+        else:
+            terms = {"safe_cost": self.safe_cost, "discount": self.discount}
+            located = replay.worth(cells, own, prices, value[:, 0], **terms)
         returns = self._returns((reports, inside, spent, located), moves[-1], value)
         # advantage is [T + 1, M + 1]: entry (n, y) is n (M + 1) + y.
         clocked = gather(advantage, self.clocks * (m + 1) + end)
@@ -382,7 +339,6 @@ class HindsightLoss(nn.Module):
         after = located[:-1] - returns[1:]
         gain = sensing_gain(clocked, after, discount=self.discount, blend=blend)
         alive = _alive(inside, reports)
-        gain = gain * (alive if self._window is None else alive * seen)
         firsts = [returns[0]]
         if self._safe_detection is not None:
             # No set is before it, so that it is the first step of a path.
@@ -391,7 +347,7 @@ class HindsightLoss(nn.Module):
         # Cells without a path get the target 0, and with no visits no weight in the critic's loss.
         totals = torch.stack([scatter_add(first, start, m) for first in firsts], dim=1)
         target = totals / torch.bincount(start, minlength=m).clamp(min=1).unsqueeze(-1)
-        return _Replayed(row, entry, alive, gain, target)
+        return _Replayed(row, entry, alive, gain * alive * seen, target)
 
     def _places(self, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """`[T+1, B]` each: row and entry as in `_Replayed`, and whether a sensor of the entry may report."""
@@ -399,64 +355,44 @@ class HindsightLoss(nn.Module):
         # clocks [T + 1, 1] broadcasts over paths. With M = K = 4 and T = 1: located in 3, n = 1 is row 7, and the
         # target moving to 2 makes entry 7 * 4 + 2 = 30.
         row = start * len(self.clocks) + self.clocks
-        entry = row * self.view.width + self.view.index(located_in, there)
         # Where the target has left the grid or the view, `entry` is some other sensor's.
-        if self._window is None:
-            return row, entry, end < self._keys.num_keys
-        return row, entry, self.view.contains(located_in.expand_as(end), there)
-
-    def _located(
-        self, replay: Replay | None, cells: Tensor, own: Tensor, prices: Tensor, value: Tensor
-    ) -> Tensor:
-        """`[T+2, B]`, the value of a detection at each step."""
-        if replay is None:
-            return gather(pad(value, (0, 1)), own[1:])
-        terms = {"safe_cost": self.safe_cost, "discount": self.discount}
-        return replay.worth(cells, own, prices, value, **terms)
+        local, width = self.view.find(located_in, there), self.view.width
+        return row, row * width + local.clamp_max(width - 1), local < width
 
     def _returns(self, steps: tuple[Tensor, ...], end: Tensor, value: Tensor) -> Tensor:
         """The returns of chains (`chain_returns`) that end with the safe action, the target then in `end` `[B]`."""
+        repeated = None
+        if self._safe_detection is not None:
+            # p_s of these cells, and L, the value there if the safe action misses.
+            repeated = self._safe_detection[end], pad(value[:, 1], (0, 1))[end]
         return chain_returns(
-            *steps,
-            safe_cost=self.safe_cost,
-            discount=self.discount,
-            repeated=self._repeated(end, value),
+            *steps, safe_cost=self.safe_cost, discount=self.discount, repeated=repeated
         )
 
-    def _repeated(self, end: Tensor, value: Tensor) -> tuple[Tensor, Tensor] | None:
-        """`[B]` each, p_s of the cells `end`, and L, the value there if the safe action misses; or None."""
-        if self._safe_detection is None:
-            return None
-        return self._safe_detection[end], pad(value[:, 1], (0, 1))[end]
-
-    def _choosable(self, nearby: Tensor, rows: slice) -> Tensor:
-        """`[rows, K]` bool, which of the sensors `nearby` `[rows, K]` of the cells `rows` can be chosen."""
-        near = self.near
+    def _choosable(self, radius: int, rows: slice) -> Tensor:
+        """`[rows, K]` bool, which of the sensors near the cells `rows` a window of that `radius` lets choose."""
+        nearby = self._near_cells[rows]
         start = torch.arange(self._keys.num_keys, device=nearby.device)[rows] // self._classes
-        window = Window((near.rows, near.columns), self._window, nearby.device)
+        window = Window(self._task, radius, nearby.device)
         return window.contains(start[:, None].expand_as(nearby), nearby)
-
-    def _set_cost(self, on: Tensor, rows: slice) -> Tensor:
-        """C(A) `[rows, T+1]` of the sets `on` of the cells `rows`."""
-        return (on * self.cost[self._of_keys(self.sensors.numbers, rows)].unsqueeze(1)).sum(-1)
 
     def _own(self, replayed: _Replayed, rows: slice, chosen: slice | Tensor) -> Tensor:
         """`[T+1]`, the actor's losses per clock, on the `chosen` paths, those from the cells `rows`."""
         logits = self.actor(rows)
         count, choices, _ = logits.shape
-        first = (rows.start or 0) * choices
-        row, entry, alive, gain = replayed.of(chosen, first, first * self.view.width)
+        row, alive = replayed.row[:, chosen] - rows.start * choices, replayed.alive[:, chosen]
+        entry = replayed.entry[:, chosen] - rows.start * choices * self.view.width
         # Paths that reach each (x, n); every sensor on costs c on each of them, the one the target moves to included.
         arrivals = scatter_add(alive, row, count * choices).view(count, choices)
-        price = arrivals.unsqueeze(-1) * self.cost[
-            self._of_keys(self.sensors.numbers, rows)
-        ].unsqueeze(1)
+        price = arrivals.unsqueeze(-1) * self.sensors.prices[rows].unsqueeze(1)
 
         def of_sensors(gain: Tensor) -> Tensor:
             on = self.actor_loss.acting(logits.detach()) if self.sensors.shared else logits
             return self.sensors.gains(gain, on, rows)
 
-        credit = SensorCredit(entry, gain, arrivals, price, rows, of_sensors, self.view.width)
+        credit = SensorCredit(
+            entry, replayed.gain[:, chosen], arrivals, price, rows, of_sensors, self.view.width
+        )
         return self.actor_loss(logits, credit).sum((0, 2))
 
     def _weights(self, which: int, count: Tensor, gain: Tensor) -> Tensor:

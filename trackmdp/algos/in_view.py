@@ -40,13 +40,15 @@ class SensorsInView(nn.Module):
         window: C cells around each located cell.
 
     Attributes:
-        numbers: `[cells, K]` int64, the sensors; S, which there is none of, where a located cell has fewer than K.
+        numbers: `[M, K]` int64, the sensors; S, which there is none of, where a located cell has fewer than K.
+        prices: `[M, K]` their prices, in units of r; 0 of S.
         width: K.
         shared: whether sensors have footprints; without, a window's cells are its sensors.
         entries: numbers that `reports` and `gains` gather for each set.
     """
 
     numbers: Tensor
+    prices: Tensor
     _of_cell: Tensor
     _cell_chance: Tensor
     _of_sensor: Tensor
@@ -58,10 +60,13 @@ class SensorsInView(nn.Module):
         self._perfect = task.perfect and (self.shared or bool(task.available.all()))
         device, classes = window.cells.device, task.keys.num_classes
         tables = _tables(task, window) if self.shared else _own(task, window)
+        # A sensor that does not exist reports nothing, and is learned to be off by a price like the others'. The last
+        # one costs nothing, so that windows cut off by the border need no mask.
+        price = np.where(task.available, task.cost, np.nanmean(task.cost)) / task.reward
+        tables["prices"] = np.append(price, 0.0).astype(np.float32)[tables["numbers"]]
         for name, table in tables.items():
-            rows = torch.as_tensor(table, device=device)
-            wide = rows if name == "numbers" else rows.repeat_interleave(classes, dim=0)
-            self.register_buffer(name, wide, persistent=False)
+            rows = torch.as_tensor(table, device=device).repeat_interleave(classes, dim=0)
+            self.register_buffer(name, rows, persistent=False)
         self.width = self.numbers.shape[1]
         self.entries = max((table[0].size for table in tables.values()), default=1)
 
