@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from trackmdp.arrays.entries import blocks
 from trackmdp.arrays.types import AnyArray, IndexArray
 from trackmdp.config import TrainConfig
 from trackmdp.config.registry import maker
@@ -147,9 +148,8 @@ def lifted(task: Task, table: PolicyTable) -> PolicyTable:
         return table
     keys = np.arange(task.num_keys)
     known = task.keys.cell(keys) * task.revealed + keys % task.revealed
-    rows = known[:, None] * task.num_choices + np.arange(task.num_choices)
     assert table.sets is not None
-    return PolicyTable(task, table.sets[rows.ravel()])
+    return PolicyTable(task, table.sets[blocks(known, task.num_choices)])
 
 
 def choosable_places(task: Task, located: IndexArray, sensors: IndexArray) -> IndexArray:

@@ -14,12 +14,12 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
+from trackmdp.algos.ways import Ways
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.policies.table import PolicyTable
-from trackmdp.sensing.decisions import sensing
 from trackmdp.sensing.task import Task
 from trackmdp.solvers.exchange import exchange
-from trackmdp.solvers.plans import Layout, Plans, Turn
+from trackmdp.solvers.plans import Plans
 from trackmdp.solvers.search import candidates_of, columns_of
 
 _ROUNDS, _JUDGES, _SURE = 3, 10, 3.0
@@ -38,11 +38,11 @@ def tried(
         discount: γ of the values.
     """
     for _ in range(_ROUNDS):
-        ways = _Ways(task, np.concatenate([draw() for _ in range(_JUDGES)], axis=1), discount)
+        ways = _Paths(task, np.concatenate([draw() for _ in range(_JUDGES)], axis=1), discount)
         before = PolicyTable(task, sets)
         value = ways.value(ways.sets(before))
         after = ways.proposed(before, value)
-        judges = (_Ways(task, draw(), discount) for _ in range(_JUDGES))
+        judges = (_Paths(task, draw(), discount) for _ in range(_JUDGES))
         gains = np.array([each.gain(before, after, value) for each in judges])
         error = gains.std(axis=0, ddof=1) / np.sqrt(_JUDGES)
         better = np.repeat(gains.mean(axis=0) > _SURE * error, task.num_choices)
@@ -53,11 +53,8 @@ def tried(
     return sets
 
 
-class _Ways:
-    """The ways on from every key on some paths, equal beginnings taken as one.
-
-    Example: from a key the target was twice in 4 then 5, once in 4 then 6, and once in 7: the first step has the
-    entries 4 and 7 with probability 3/4 and 1/4, the second 5, 6 and 8 (for instance); 4 moves to 5 with 2/3.
+class _Paths:
+    """The ways on from every key on some paths, put together from moves (`ways`).
 
     Args:
         task: its sensors and prices.
@@ -66,37 +63,24 @@ class _Ways:
     """
 
     def __init__(self, task: Task, paths: IndexArray, discount: float) -> None:
-        self._task, self._ends, self._count = task, list[IndexArray](), task.num_keys
-        rows, entry, turns = np.arange(self._count), paths[0], list[Turn]()
-        located = task.keys.cell(rows)
-        for step in range(1, len(paths)):
-            number = len(rows)
-            arrived = np.bincount(entry, minlength=number)
-            inside = paths[step] < self._count
-            paths, entry = paths[:, inside], entry[inside]
-            codes, now, mass = np.unique(
-                entry * self._count + paths[step], return_inverse=True, return_counts=True
-            )
-            begun, end = np.divmod(codes, self._count)
-            chance = discount * mass / arrived[begun]
-            if step == len(paths) - 1:
-                self._last = sparse.csr_array((chance, (begun, end)), shape=(number, self._count))
-                break
-            moves = sparse.csr_array(
-                (chance, (begun, np.arange(len(codes)))), shape=(number, len(codes))
-            )
-            rows, entry = rows[begun], now
-            choice = sensing(task, rows, task.keys.cell(end), self._count, located)
-            turns.append(Turn(rows, moves, moves.sum(axis=1), choice, task.prices[choice.sensors]))
-            self._ends.append(end)
-        self._layout = Layout(np.arange(self._count), turns, self._count)
+        self._task, self._count = task, task.num_keys
+        # `[E]`, the first key of each entry and its key in each step, the forced one the last.
+        self._steps: list[tuple[IndexArray, IndexArray]] = []
+        located = task.keys.cell(np.arange(self._count))
+        ways = Ways(task, located, paths[0], np.ones(paths.shape[1]), discount)
+        for keys in paths[1:]:
+            inside = np.flatnonzero(keys < self._count)
+            self._last, end = ways.moved(inside, keys[inside], self._count)
+            self._steps.append((ways.rows, end))
+            if len(ways.turns) < task.num_choices:
+                ways.choose(self._last, task.keys.cell(end))
+        self._layout = ways.layout()
 
     def plans(self, value: Array) -> Plans:
         """The plans of all keys, V `[keys]` given."""
-        task = self._task
-        worth = task.reward + value
-        missed = self._last @ (worth - task.safe_cost)
-        return Plans(self._layout, np.ones(self._count), [worth[end] for end in self._ends], missed)
+        *detected, missed = (self._task.reward + value[end] for _, end in self._steps)
+        missed = self._last @ (missed - self._task.safe_cost)
+        return Plans(self._layout, np.ones(self._count), detected, missed)
 
     def sets(self, policy: PolicyTable) -> list[BoolArray]:
         """Its decisions here, `[G]` for each free choice."""
@@ -106,15 +90,17 @@ class _Ways:
     def value(self, sets: list[BoolArray]) -> Array:
         """V `[keys]` of a policy: V = b + K V, K the discounted chance of the key at the next detection."""
         count, plans = self._count, self.plans(np.zeros(self._count))
-        chances, mass = [], plans.mass
-        for turn, end, on in zip(plans.turns, self._ends, candidates_of(sets), strict=True):
+        chances, mass = list[Array](), plans.mass
+        for turn, on in zip(plans.turns, candidates_of(sets), strict=True):
             mass = turn.back @ mass
-            found = mass * turn.choice.report(on)
-            chances.append(sparse.csr_array((found[:, 0], (turn.rows, end)), shape=(count, count)))
-            mass = mass - found
-        last = (turn.rows, np.arange(len(mass)))
-        rows = sparse.csr_array((mass[:, 0], last), shape=(count, len(mass)))
-        located = sum(chances, rows @ self._last)
+            chances.append(mass * turn.choice.report(on))
+            mass = mass - chances[-1]
+        chances.append(self._last.T @ mass)
+        *found, last = (
+            sparse.csr_array((chance[:, 0], step), shape=(count, count))
+            for chance, step in zip(chances, self._steps, strict=True)
+        )
+        located = sum(found, last)
         earned = plans.worth_of(sets)
         return spsolve(sparse.eye_array(count, format="csc") - located.tocsc(), earned)
 

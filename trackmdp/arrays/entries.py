@@ -61,6 +61,11 @@ def padded_rows(
     return columns, numbers
 
 
+def blocks(places: IndexArray, size: int) -> IndexArray:
+    """The rows of blocks of `size` rows each: of the blocks 3 and 1, with two rows, they are 6 7 2 3."""
+    return (places[:, None] * size + np.arange(size)).ravel()
+
+
 def ranks(rows: IndexArray) -> IndexArray:
     """`[E]` the place of each entry in its row, of `rows` `[E]` in order: of 0 0 2 they are 0 1 0."""
     return np.arange(len(rows)) - np.searchsorted(rows, rows)

@@ -13,10 +13,10 @@ from scipy import sparse
 from tests.algos.estimates.test_path_counts import planned
 from tests.tracks import by_hand, recorded
 from trackmdp.algos.estimates import path_plans
-from trackmdp.algos.estimates.path_counts import KeyPlans, along, interleaved
+from trackmdp.algos.estimates.path_counts import KeyPlans, along
 from trackmdp.algos.estimates.path_gains import AlongPaths, Paths, thinned
 from trackmdp.algos.estimates.path_plans import PRIORS, choose_plan, exchanged_keys, parted
-from trackmdp.policies.table import PolicyTable
+from trackmdp.policies.table import PolicyTable, SetTable
 from trackmdp.recordings.tracks import Recorded, Tracks
 from trackmdp.solvers.value import replay
 
@@ -38,6 +38,12 @@ def repeated(tracks: Tracks, times: list[int]) -> Tracks:
     pieces = [list(piece) for piece in np.split(tracks.cells, tracks.first[1:-1])]
     copies = [piece for piece, count in zip(pieces, times, strict=True) for _ in range(count)]
     return replace(by_hand(*copies, exits=False), names=np.repeat(tracks.names, times))
+
+
+def sets_of(table: SetTable) -> np.ndarray:
+    """`[plans, 2, S]`, the sets of a table."""
+    assert table.sets is not None
+    return np.asarray(table.sets.toarray().reshape(table.plans, 2, -1))
 
 
 def earned(paths: Paths, plan: np.ndarray, points: np.ndarray, followed: AlongPaths) -> float:
@@ -68,11 +74,12 @@ def test_a_round_finds_the_best_plan_of_each_key(seed: int, first: bool) -> None
     task = Recorded(
         tracks, (1, 2), validation=tracks, held_out=tracks, cost=0.4, safe_cost=0.6, t_max=1
     )
-    paths, sets = Paths(task, tracks, 0.9), [sparse.csr_array(np.full((2, 2), first))] * 2
-    followed = paths.follow(interleaved(task, sets))
-    changed = exchanged_keys(paths, sets, followed, 1)
+    paths = Paths(task, tracks, 0.9)
+    table = SetTable(task, sparse.csr_array(np.full((4, 2), first)), 2)
+    followed = paths.follow(table)
+    changed = exchanged_keys(paths, table, followed, 1)
     assert changed is not None
-    found = np.stack([each.toarray() for each in changed(1.0)], axis=1)
+    found = sets_of(changed(1.0))
     plans = np.array(list(itertools.product([False, True], repeat=4))).reshape(16, 2, 2)
     for key in range(2):
         # Of cells alone the events are the points, in order.
@@ -114,17 +121,17 @@ def test_paths_that_are_there_three_times_say_what_they_say_once_to_three_times_
 def test_rare_keys_keep_their_plans() -> None:
     task = recorded(line_walks(1), memory="displacement", clip=1)
     paths = Paths(task, task.tracks, 0.9)
-    sets = [sparse.csr_array((len(paths.keys), 9), dtype=bool)] * 2
-    followed = paths.follow(interleaved(task, sets))
-    assert exchanged_keys(paths, sets, followed, 10**6) is None
-    some = exchanged_keys(paths, sets, followed, 5)
+    none = SetTable(task, sparse.csr_array((2 * len(paths.keys), 9), dtype=bool), len(paths.keys))
+    followed = paths.follow(none)
+    assert exchanged_keys(paths, none, followed, 10**6) is None
+    some = exchanged_keys(paths, none, followed, 5)
     assert some is not None
     often = np.bincount(paths.renewal.owner, followed.visits) >= 5
     assert 0 < often.sum() < len(paths.keys)
-    changed = sum(each.sum(axis=1) for each in some(1.0)) > 0
+    changed = sets_of(some(1.0)).any(axis=(1, 2))
     assert changed.any()
     assert not changed[~often].any()
-    fewer = sum(each.sum(axis=1) for each in some(0.25)) > 0
+    fewer = sets_of(some(0.25)).any(axis=(1, 2))
     assert 0 < fewer.sum() < changed.sum()
     assert not fewer[~changed].any()
 
@@ -254,16 +261,13 @@ def test_what_is_asked_for_is_what_the_table_of_all_keys_says() -> None:
     task = recorded(line_walks(3), memory="two_displacements", clip=1)
     paths = Paths(task, task.tracks, 0.9)
     plans = planned(task, task.tracks, prior=3.0, rounds=3).plans
-    changed = replace(
-        plans, sets=[sparse.csr_array(np.ones(each.shape, dtype=bool)) for each in plans.sets]
-    )
-    for each in (plans, changed, KeyPlans.of_table(plans.table(), paths.keys[::2])):
-        table = each.table().dense()
+    every = sparse.csr_array(np.ones((2 * len(paths.keys), 9), dtype=bool))
+    changed = replace(plans, table=SetTable(task, every, len(paths.keys)))
+    for each in (plans, changed, KeyPlans.of_table(plans.policy(), paths.keys[::2])):
+        table = each.policy().dense()
         keys = np.random.default_rng(0).permutation(np.concatenate([paths.keys, np.arange(200)]))
-        sets = each.of(keys).sets
-        assert sets is not None
-        assert (sets.toarray().reshape(len(keys), 2, 9) == table[keys]).all()
+        assert (sets_of(each.on(keys).table) == table[keys]).all()
         assert table.any()
-    assert changed.table().dense()[paths.keys].all()
+    assert changed.policy().dense()[paths.keys].all()
     unseen = np.delete(np.arange(task.num_keys), paths.keys)
-    assert (changed.table().dense()[unseen] == plans.table().dense()[unseen]).all()
+    assert (changed.policy().dense()[unseen] == plans.policy().dense()[unseen]).all()

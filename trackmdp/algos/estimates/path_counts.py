@@ -16,7 +16,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.algos.estimates.path_gains import AlongPaths, Paths
-from trackmdp.arrays.entries import among, ones_at, per_row, summing
+from trackmdp.arrays.entries import among, blocks, ones_at, per_row, summing
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.grid.displacements import apart, cell_at, displacement
 from trackmdp.memory.keys import KeySpace
@@ -57,67 +57,56 @@ class Planned:
     @cached_property
     def policy(self) -> PolicyTable:
         """The plans as a table of all keys."""
-        return self.plans.table()
+        return self.plans.policy()
 
 
 @dataclass(frozen=True)
 class KeyPlans:
-    """A policy that does not draw, as rows of some keys and a rule for all others.
+    """A policy that does not draw, as plans of some keys and a rule for all others.
 
     Attributes:
-        task: limits and memory.
-        keys: `[K]` keys with rows, in order.
-        sets: `[K, S]` bool, one for each n.
-        others: from n and other keys `[Q]` to their sets, `[Q, S]` bool.
+        keys: `[K]` keys with plans, in order.
+        table: their plans.
+        others: from other keys `[Q]` to their sets, `[Q * (t_max + 1), S]` bool.
     """
 
-    task: Task
     keys: IndexArray
-    sets: Sequence[sparse.csr_array]
-    others: Callable[[int, IndexArray], sparse.csr_array]
+    table: SetTable
+    others: Callable[[IndexArray], sparse.csr_array]
 
     @classmethod
     def of_table(cls, policy: PolicyTable, keys: IndexArray) -> KeyPlans:
         """A policy with sets, `keys` apart."""
-        table, choices = policy.sets, policy.task.num_choices
-        assert table is not None
+        task, sets = policy.task, policy.sets
+        assert sets is not None
 
-        def rows(n: int, keys: IndexArray) -> sparse.csr_array:
-            return table[keys * choices + n]
+        def rows(keys: IndexArray) -> sparse.csr_array:
+            return sets[blocks(keys, task.num_choices)]
 
-        return cls(policy.task, keys, [rows(n, keys) for n in range(choices)], rows)
-
-    def of(self, keys: IndexArray) -> SetTable:
-        """The sets of `keys`, in their order."""
-        return interleaved(self.task, self._rows(keys))
+        return cls(keys, SetTable(task, rows(keys), len(keys)), rows)
 
     def on(self, keys: IndexArray) -> KeyPlans:
-        """The same policy with rows of other `keys`, in order."""
-        return KeyPlans(self.task, keys, self._rows(keys), self.others)
+        """The same policy with plans of other `keys`, in their order."""
+        task, (place, known) = self.table.task, among(self.keys, keys)
+        assert self.table.sets is not None
+        own = self.table.sets[blocks(place[known], task.num_choices)]
+        both = sparse.vstack([own, self.others(keys[~known])], format="csr")
+        # Rows of the known keys, then those of the others, are brought into the order of `keys`.
+        order = np.argsort(~known, kind="stable").argsort()
+        sets = both[blocks(order, task.num_choices)]
+        return KeyPlans(keys, SetTable(task, sets, len(keys)), self.others)
 
-    def _rows(self, keys: IndexArray) -> list[sparse.csr_array]:
-        """`[Q, S]` bool for each n."""
-        place, known = among(self.keys, keys)
-        # Rows of the known keys, then those of the others, brought into the order of `keys`.
-        order = np.argsort(np.concatenate([np.flatnonzero(known), np.flatnonzero(~known)]))
-        found = []
-        for n, sets in enumerate(self.sets):
-            both = [sets[place[known]], self.others(n, keys[~known])]
-            found.append(sparse.vstack(both, format="csr")[order])
-        return found
-
-    def table(self) -> PolicyTable:
+    def policy(self) -> PolicyTable:
         """The sets of all keys there are."""
-        return PolicyTable(self.task, self.of(np.arange(self.task.num_keys)).sets)
+        task = self.table.task
+        return PolicyTable(task, self.on(np.arange(task.num_keys)).table.sets)
 
 
-def interleaved(task: Task, sets: Sequence[sparse.csr_array]) -> SetTable:
-    """The rows of a table of plans, from `[K, S]` bool for each n."""
-    count = sets[0].shape[0]
+def interleaved(sets: Sequence[sparse.csr_array]) -> sparse.csr_array:
+    """The rows of a table of plans, from `[K, S]` for each n."""
     # Plan k after n misses is row k (t_max + 1) + n.
-    order = np.arange(count * len(sets)).reshape(len(sets), count).T.ravel()
-    stacked = sparse.vstack(sets, format="csr")[order]
-    return SetTable(task, stacked, count)
+    order = np.arange(len(sets) * sets[0].shape[0]).reshape(len(sets), -1).T.ravel()
+    return sparse.vstack(sets, format="csr")[order]
 
 
 def plan_paths(
@@ -211,7 +200,7 @@ class _Counted:
         # Every level follows sets of its own: its counts at n are of targets that its own sets have missed so far.
         alive = [weight[: renewal.count] for _ in range(len(shared) + 1)]
         self._shared: list[_Shared] = []
-        self.sets: list[sparse.csr_array] = []
+        sets: list[sparse.csr_array] = []
         above = self._above()
         for n, (step, gain) in enumerate(zip(renewal.steps, gains, strict=False)):
             mean = np.zeros((1, view.width))
@@ -227,15 +216,11 @@ class _Counted:
                 n, np.arange(len(renewal.plans)), len(renewal.plans), gain, mass
             )
             self._shared.append(_Shared.of(view, mean, own, arrived, prior))
-            self.sets.append(self._sets_of_seen(own, arrived))
-            table = SetTable(_one_set(task), self.sets[-1], len(renewal.plans))
+            sets.append(self._sets_of_seen(own, arrived))
+            table = SetTable(_one_set(task), sets[-1], len(renewal.plans))
             report = table.reports(0, view.plan[n], view.cell[n])
             alive[-1] = _left(renewal.count, step.rows, mass * (1.0 - report))
-
-    @cached_property
-    def table(self) -> SetTable:
-        """The sets of the keys seen."""
-        return interleaved(self._view.paths.task, self.sets)
+        self.table = SetTable(task, interleaved(sets), len(renewal.plans))
 
     def _reports(self, n: int, context: IndexArray, mean: Array) -> Array:
         """`[E]`, probability of a report by the sets of a level with mean gains `mean` `[C, W]`."""
@@ -290,11 +275,15 @@ class _Counted:
 
     def plans(self) -> KeyPlans:
         """The sets of all keys: by their own count, or by the prior mean alone."""
-        return KeyPlans(self._view.paths.task, self._view.paths.keys, self.sets, self._unseen)
+        return KeyPlans(self._view.paths.keys, self.table, self._unseen)
 
-    def _unseen(self, n: int, keys: IndexArray) -> sparse.csr_array:
+    def _unseen(self, keys: IndexArray) -> sparse.csr_array:
         """The sets after keys that were not seen."""
-        view, shared, task = self._view, self._shared[n], self._view.paths.task
+        return interleaved([self._expected(shared, keys) for shared in self._shared])
+
+    def _expected(self, shared: _Shared, keys: IndexArray) -> sparse.csr_array:
+        """`[Q, S]`, the sets after `keys` by their prior means alone."""
+        view, task = self._view, self._view.paths.task
         classes = task.keys.num_classes
         known = keys % classes
         least = float(task.prices.min()) if task.coverage is None else 0.0
@@ -400,4 +389,4 @@ def _mean(gains: Array, arrived: Array, strength: float, above: Array) -> Array:
 
 def along(paths: Paths, plans: KeyPlans) -> AlongPaths:
     """Plans followed on paths."""
-    return paths.follow(plans.of(paths.keys))
+    return paths.follow(plans.on(paths.keys).table)

@@ -81,11 +81,12 @@ class Paths:
         times: `[B]`, how often the path of each event is among the tracks.
         copies: tracks for each that differs.
         moves: on all of the tracks.
+        discount: γ.
         levels: of the events, whose places in their paths these are.
     """
 
     def __init__(self, task: Task, tracks: Tracks, discount: float) -> None:
-        self.task, self._discount = task, discount
+        self.task, self.discount = task, discount
         self.moves = len(tracks.cells) - len(tracks)
         tracks, times = different(tracks)
         self.renewal = Renewal(task, tracks.motion().discounted(discount))
@@ -109,7 +110,7 @@ class Paths:
             acts.append((report, table.spent(n, self.task.paid)[owner]))
         steps = renewal.passes(acts)
         # Undiscounted: the moves before the end of step n carry γ^(n + 1), of a repeated safe action γ.
-        factors = [np.full(renewal.count, self._discount ** -(n + 1)) for n in range(len(steps))]
+        factors = [np.full(renewal.count, self.discount ** -(n + 1)) for n in range(len(steps))]
         factors[-1][renewal.count - renewal.events.forced :] = factors[0][0]
         plain = sum(
             with_data(step.located, step.located.data * factor[row_index(step.located)])

@@ -12,19 +12,18 @@ from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
-from scipy import sparse
 
-from trackmdp.algos.estimates.path_counts import KeyPlans, Planned, along, interleaved, plan_paths
+from trackmdp.algos.estimates.path_counts import KeyPlans, Planned, along, plan_paths
 from trackmdp.algos.estimates.path_gains import AlongPaths, Paths, thinned
+from trackmdp.algos.ways import Ways
 from trackmdp.arrays.entries import ones_at, per_row, row_index
 from trackmdp.arrays.types import Array, IndexArray
-from trackmdp.policies.table import PolicyTable
+from trackmdp.policies.table import PolicyTable, SetTable
 from trackmdp.recordings.tracks import Tracks, shuffled
 from trackmdp.seeding import derive
-from trackmdp.sensing.decisions import sensing
 from trackmdp.sensing.task import Task
 from trackmdp.solvers.exchange import exchange
-from trackmdp.solvers.plans import Layout, Plans, Turn
+from trackmdp.solvers.plans import Plans
 from trackmdp.solvers.search import candidates_of, columns_of
 
 PRIORS = (1.0, 3.0, 10.0, 30.0, 100.0)
@@ -98,7 +97,7 @@ def choose_plan(
     place = order[number if stage < 2 else near[first]]
     whole = Paths(task, thinned(task, tracks, _MOST, seed), discount)
     if stage == 0 and place >= len(priors):  # as it was made
-        again = _made(others[place - len(priors)], tracks, whole, plans[best].table())
+        again = _made(others[place - len(priors)], tracks, whole, plans[best].policy())
         return _valued(whole, again)
     last = _improved(whole, weights[place], rounds, plans[best])  # from the plan that was chosen
     return _searched(whole, last) if stage == 2 else last
@@ -157,18 +156,16 @@ def parted(tracks: Tracks, seed: int) -> tuple[Tracks, Tracks]:
 
 def _searched(paths: Paths, plan: Planned) -> Planned:
     """Rounds of exchange from `plan`; where one raises no reward, half as many keys change, those of largest gain."""
-    plans, share = plan.plans, 1.0
-    followed = along(paths, plans)
-    found = exchanged_keys(paths, plans.sets, followed, _LEAST)
+    share, followed = 1.0, along(paths, plan.plans)
+    found = exchanged_keys(paths, plan.plans.table, followed, _LEAST)
     for _ in range(_ROUNDS):
         if found is None:  # no key comes so often
             break
-        sets = found(share)
-        tried = paths.follow(interleaved(paths.task, sets))
+        table = found(share)
+        tried = paths.follow(table)
         if tried.reward > plan.reward * (1.0 + _RISE):
-            plans = replace(plans, sets=sets)
-            plan = replace(plan, plans=plans, reward=tried.reward)
-            found = exchanged_keys(paths, sets, tried, _LEAST)
+            plan = replace(plan, plans=replace(plan.plans, table=table), reward=tried.reward)
+            found = exchanged_keys(paths, table, tried, _LEAST)
         elif share > _LEAST_SHARE:
             share /= 2
         else:
@@ -177,100 +174,68 @@ def _searched(paths: Paths, plan: Planned) -> Planned:
 
 
 def exchanged_keys(
-    paths: Paths,
-    sets: Sequence[sparse.csr_array],
-    followed: AlongPaths,
-    least: int,
-) -> Callable[[float], list[sparse.csr_array]] | None:
+    paths: Paths, table: SetTable, followed: AlongPaths, least: int
+) -> Callable[[float], SetTable] | None:
     """One round: the plans of keys that a policy came by `least` times or more, on the ways on from them.
 
     Args:
         paths: all events of the paths.
-        sets: `[K, S]` bool of the policy for each n; left as they are.
+        table: of the policy, a plan for each key of the paths.
         followed: the policy on the paths.
         least: keys that came less often keep their plans.
 
     Returns:
-        The sets by the share of the keys with better plans that change, the ones that gain most: with all changed at
+        The table by the share of the keys with better plans that change, the ones that gain most: with all changed at
         once visits may change. None where no key came so often.
     """
-    owner = paths.renewal.owner
-    arrived = per_row(owner, followed.visits, len(paths.keys))
+    arrived = per_row(paths.renewal.owner, followed.visits, len(paths.keys))
     often = np.flatnonzero(arrived >= least)
     if not len(often):
         return None
-    plans = _trees(paths, followed, often)
-    before = []
-    for turn, old in zip(plans.turns, sets, strict=True):
-        place = (often[turn.choice.rows], turn.choice.sensors)
-        before.append(np.asarray(old[place]).ravel())
+    plans, sets = _trees(paths, followed, often), table.sets
+    assert sets is not None
+    choices = [turn.choice for turn in plans.turns]
+    before = [table.chosen(n, often[each.rows], each.sensors) > 0 for n, each in enumerate(choices)]
     ascended = columns_of(plans.ascend(candidates_of(before), sweeps=2))
     found = exchange(plans, ascended, np.ones(len(often), dtype=bool))
     worth, other = (plans.worth_of(each) for each in (before, found))
     gain = other - worth
 
-    def changed(share: float) -> list[sparse.csr_array]:
+    def changed(share: float) -> SetTable:
         few = gain < np.quantile(gain[gain > 0], 1.0 - share) if (gain > 0).any() else gain < 0
         # The rows of these keys are replaced, those of all others stay.
         stays = np.ones(len(paths.keys), dtype=bool)
         stays[often[~few]] = False
-        after = []
-        for turn, old, new in zip(plans.turns, sets, found, strict=True):
-            on = new & ~few[turn.choice.rows]
-            rows, kept = row_index(old), stays[row_index(old)]
-            row = np.concatenate([rows[kept], often[turn.choice.rows[on]]])
-            sensor = np.concatenate([old.indices[kept], turn.choice.sensors[on]])
-            after.append(ones_at(row, sensor, old.shape))
-        return after
+        kept = stays[row_index(sets) // len(choices)]
+        rows, sensors = [row_index(sets)[kept]], [sets.indices[kept]]
+        for n, (each, on) in enumerate(zip(choices, found, strict=True)):
+            new = on & ~few[each.rows]
+            rows.append(often[each.rows[new]] * len(choices) + n)
+            sensors.append(each.sensors[new])
+        after = ones_at(np.concatenate(rows), np.concatenate(sensors), sets.shape)
+        return SetTable(paths.task, after, len(paths.keys))
 
     return changed
 
 
 def _trees(paths: Paths, followed: AlongPaths, keys: IndexArray) -> Plans:
-    """The ways on from `keys` (places among those seen), equal beginnings taken as one.
-
-    Example: after a key the target was twice in 4 then 5, once in 4 then 6, and once in 7: the first step has the
-    entries 4 and 7 with mass 3 and 1, the second 5, 6 and 8 (for instance) with 2, 1 and 1; 4 moves to 5 with 2/3.
-    """
+    """The ways on from `keys` (places among those seen), each event that is followed being a path (`ways`)."""
     task, renewal = paths.task, paths.renewal
     cells, located = renewal.motion.cell, renewal.keys.cell(renewal.plans[keys])
     number = np.full(len(paths.keys), -1)
     number[keys] = np.arange(len(keys))
-    # Weight and entry of each event that is followed; the entries before any move are the keys.
-    weight = np.where(number[renewal.owner] >= 0, followed.visits * paths.times, 0.0)
-    entry = np.maximum(number[renewal.owner], 0)
-    start = mass = per_row(entry, weight, len(keys))
-    rows, turns, detected = np.arange(len(keys)), [], []
+    row = number[renewal.owner]
+    weight = np.where(row >= 0, followed.visits * paths.times, 0.0)
+    ways = Ways(task, located, np.maximum(row, 0), weight, paths.discount)
+    start, detected = ways.mass, []
+
+    def mean(events: IndexArray, worth: Array) -> Array:
+        """`[E]`, of the events at each entry."""
+        return per_row(ways.entry[events], ways.weight[events] * worth, len(ways.mass)) / ways.mass
+
     for step in renewal.steps[:-1]:
-        some = np.flatnonzero(weight[step.rows] > 0)
-        event, cell, stay = step.rows[some], cells[step.states[some]], step.moves.data
-        # Entries stay in order of their rows: a code begins with the entry before, and that with its row.
-        codes, now = np.unique(entry[event] * task.num_cells + cell, return_inverse=True)
-        before, arrived = codes // task.num_cells, per_row(now, weight[event], len(codes))
-        # Each move carries the discount of the paths' own moves.
-        chance = stay[0] * arrived / mass[before] if len(stay) else arrived
-        place = (before, np.arange(len(codes)))
-        moves = sparse.csr_array((chance, place), shape=(len(mass), len(codes)))
-        worth = task.reward + followed.value[step.following[some]]
-        detected.append(per_row(now, weight[event] * worth, len(codes)) / arrived)
-        rows, inside = rows[before], moves.sum(axis=1)
-        choice = sensing(task, rows, codes % task.num_cells, len(keys), located)
-        turns.append(Turn(rows, moves, inside, choice, task.prices[choice.sensors]))
-        left = np.zeros_like(weight)
-        left[event] = weight[event]
-        weight, mass = left, arrived
-        entry = np.zeros(len(weight), dtype=np.int64)
-        entry[event] = now
-    missed = _left_over(paths, followed, weight, entry, mass)
-    return Plans(Layout(np.arange(len(keys)), turns, len(keys)), start, detected, missed)
-
-
-def _left_over(
-    paths: Paths, followed: AlongPaths, weight: Array, entry: IndexArray, mass: Array
-) -> Array:
-    """`[E]`, mean worth of a miss at each entry of the last free choice."""
-    last = paths.renewal.steps[-2]
-    worth = np.zeros(len(weight))
-    worth[last.rows] = paths.renewal.missed(followed.value)
-    some = weight > 0
-    return per_row(entry[some], (weight * worth)[some], len(mass)) / mass
+        some = np.flatnonzero(ways.weight[step.rows] > 0)
+        ways.choose(*ways.moved(step.rows[some], cells[step.states[some]], task.num_cells))
+        detected.append(mean(step.rows[some], task.reward + followed.value[step.following[some]]))
+    missed = mean(step.rows, renewal.missed(followed.value))
+    return Plans(ways.layout(), start, detected, missed)
