@@ -70,8 +70,9 @@ def test_credit_adds_up_by_hand() -> None:
     gain = torch.tensor([[3.0, -0.5, 1.0], [2.0, 0.0, 0.0]])
     price = torch.tensor([[[0.25, 0.5, 0.75], [0.1, 0.2, 0.3]]])
     credit = SensorCredit(entry, gain, torch.tensor([[3.0, 1.0]]), price)
-    assert credit.plus.tolist() == [[[4.0, 0.0, 0.0], [0.0, 2.0, 0.0]]]
-    assert credit.minus.tolist() == [[[0.0, 0.0, 0.5], [0.0, 0.0, 0.0]]]
+    plus, minus = credit.signed
+    assert plus.tolist() == [[[4.0, 0.0, 0.0], [0.0, 2.0, 0.0]]]
+    assert minus.tolist() == [[[0.0, 0.0, 0.5], [0.0, 0.0, 0.0]]]
     torch.testing.assert_close(
         credit.advantage, torch.tensor([[[3.75, -0.5, -1.25], [-0.1, 1.8, -0.3]]])
     )

@@ -53,7 +53,8 @@ class SensorCredit:
     cells: int | None = None
 
     @cached_property
-    def _sums(self) -> tuple[Tensor, Tensor]:
+    def signed(self) -> tuple[Tensor, Tensor]:
+        """G⁺ and G⁻ `[M, T+1, K]`, the sum of the positive gains, and minus the sum of the negative ones."""
         shape = (*self.arrivals.shape, self.cells or self.price.shape[-1])
         size = math.prod(shape)
         # One scatter for both signs: with 32 entries, a gain of -.5 at entry 30 adds .5 to place 30 + 32 = 62, the
@@ -62,20 +63,11 @@ class SensorCredit:
         plus, minus = scatter_add(self.gain.abs(), negative, 2 * size).view(2, *shape)
         return self.of_sensors(plus), self.of_sensors(minus)
 
-    @property
-    def plus(self) -> Tensor:
-        """G⁺ `[M, T+1, K]`, the sum of the positive gains."""
-        return self._sums[0]
-
-    @property
-    def minus(self) -> Tensor:
-        """G⁻ `[M, T+1, K]`, minus the sum of the negative ones."""
-        return self._sums[1]
-
     @cached_property
     def advantage(self) -> Tensor:
         """Δ = G⁺ - G⁻ - c `[M, T+1, K]`, worth of a sensor on over off."""
-        return self.plus - self.minus - self.price
+        plus, minus = self.signed
+        return plus - minus - self.price
 
     def sampled(self, on: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Δ `[M, T+1, K]` of the paths on which a sensor was drawn on, and of those on which it was off.
@@ -141,7 +133,7 @@ class Decision(ActorLoss):
 
     def forward(self, logits: Tensor, credit: SensorCredit) -> Tensor:
         """(c + G⁻) softplus(z) + G⁺ softplus(-z)."""
-        return decision_loss(logits, credit.plus, credit.minus, credit.price)
+        return decision_loss(logits, *credit.signed, credit.price)
 
 
 class PolicyGradient(ActorLoss):
@@ -252,7 +244,8 @@ class Poisson(ActorLoss):
         """C e^z - (G⁺ - G⁻) z, z no larger than for any gain."""
         z = logits.clamp(-_LARGEST_LOGIT, _LARGEST_LOG_RATIO)
         # Derivative in z: c e^z - (G⁺ - G⁻), zero at e^z = (G⁺ - G⁻) / c, which is above 1 exactly where sensing pays.
-        return credit.price * z.exp() - (credit.plus - credit.minus) * z
+        plus, minus = credit.signed
+        return credit.price * z.exp() - (plus - minus) * z
 
 
 def decision_loss(logits: Tensor, plus: Tensor, minus: Tensor, price: Tensor) -> Tensor:

@@ -248,6 +248,4 @@ def _sensors_on(batch: TensorDictBase) -> float:
     """Sensors switched on by choice in a batch."""
     # At n = t_max + 1 the safe action replaces the policy's set, and no sensor is switched on.
     free = batch["steps_since_detection"] < batch["action_history"].shape[-2]
-    if free.all():
-        return float(batch["action"].count_nonzero())
-    return float((batch["action"].sum(-1) * free).sum())
+    return float((batch["action"].count_nonzero(-1) * free).sum())

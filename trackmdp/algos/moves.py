@@ -7,14 +7,13 @@ target's cell and some of its past. All statements on cells and M hold for keys 
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
 
-from trackmdp.algos.common import Checkpointed
 from trackmdp.sensing.task import Task
 
 
@@ -124,7 +123,7 @@ def sensed_moves(batch: TensorDictBase, num_cells: int) -> tuple[Tensor, Tensor]
     return batch[name][whole], torch.where(exited, num_cells, after[name])[whole]
 
 
-class MoveBuffer(Checkpointed):
+class MoveBuffer:
     """Replay buffer of moves from a located cell to the cell sensed next, or to M, outside.
 
     A path drawn from it is put together: any move seen out of a cell may follow any arrival there, since the next move
@@ -136,43 +135,37 @@ class MoveBuffer(Checkpointed):
         generator: draws the paths; the buffer lives on its device.
     """
 
-    parts: ClassVar[tuple[str, ...]] = ("_moves",)
-
     def __init__(self, task: Task, capacity: int, generator: torch.Generator) -> None:
         self.num_cells, self._capacity, self._generator = task.num_keys, capacity, generator
         self._weights = report_weights(task, generator.device)
-        # Oldest first; those of the last batches wait to be appended, which copies all that is there.
-        self._moves = torch.empty(2, 0, dtype=cell_dtype(self.num_cells), device=generator.device)
-        self._fresh: list[Tensor] = []
+        # Oldest first, `[2, K]` each.
+        self._parts = [torch.empty(2, 0, dtype=cell_dtype(self.num_cells), device=generator.device)]
         self._index: tuple[Tensor, CellIndex] | None = None
 
     def __len__(self) -> int:
-        return min(self._moves.shape[1] + self._waiting, self._capacity)
+        return min(self._seen, self._capacity)
+
+    @property
+    def _seen(self) -> int:
+        return sum(part.shape[1] for part in self._parts)
 
     def extend(self, batch: TensorDictBase) -> None:
         """Add the moves sensed in a collected batch `[B, time]`."""
-        self._fresh.append(torch.stack(sensed_moves(batch, self.num_cells)).to(self._moves))
+        self._parts.append(torch.stack(sensed_moves(batch, self.num_cells)).to(self._parts[0]))
         self._index = None
-        # As many waiting as appended: every move is then copied a few times at most, however long the run.
-        if self._waiting > self._moves.shape[1]:
-            self._appended()
+        # Twice as many as are kept: every move is then copied a few times at most, however long the run.
+        if self._seen > 2 * self._capacity:
+            self._kept()
 
-    @property
-    def _waiting(self) -> int:
-        return sum(part.shape[1] for part in self._fresh)
-
-    def _appended(self) -> Tensor:
+    def _kept(self) -> Tensor:
         """`[2, K]`, all moves kept."""
-        if self._fresh:
-            self._moves = torch.cat([self._moves, *self._fresh], dim=1)[
-                :, -self._capacity :
-            ].contiguous()
-            self._fresh = []
-        return self._moves
+        whole = torch.cat(self._parts, dim=1)[:, -self._capacity :].contiguous()
+        self._parts = [whole]
+        return whole
 
     def moves(self) -> tuple[Tensor, Tensor]:
         """Cells before and after every move, int64 `[K]` each."""
-        start, end = self._appended().long()
+        start, end = self._kept().long()
         return start, end
 
     def paths(self, count: int, steps: int, generator: torch.Generator | None = None) -> Tensor:
@@ -204,10 +197,8 @@ class MoveBuffer(Checkpointed):
 
     def state_dict(self) -> dict[str, Any]:
         """The moves; the generator is its owner's to save."""
-        self._appended()
-        return super().state_dict()
+        return {"moves": self._kept()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
-        super().load_state_dict(state)
-        self._fresh, self._index = [], None
+        self._parts, self._index = [state["moves"].to(self._parts[0])], None

@@ -20,7 +20,7 @@ from trackmdp.algos.estimates.censored import ObservedPaths, hidden_cells
 from trackmdp.algos.estimates.hidden_cells import Missed, redrawn
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.moves import known_as
-from trackmdp.arrays.entries import ones_at
+from trackmdp.arrays.entries import ones_at, row_index
 from trackmdp.arrays.types import Array, BoolArray, IndexArray, Indices
 from trackmdp.recordings.tracks import Tracks, ends_of
 from trackmdp.sensing.coverage import reported
@@ -122,14 +122,11 @@ class _Sensed(ObservedPaths):
         """The paths with misses of no set for those of the safe action."""
         if not self.waits.any():
             return self
-        more = int(self.waits.max())
-        lengths = np.diff(self.sensed.indptr).reshape(-1, self.choices)
-        wide = np.pad(lengths, ((0, 0), (0, more))).ravel()
-        pointer = np.concatenate([[0], np.cumsum(wide)])
-        sensed = sparse.csr_array(
-            (self.sensed.data, self.sensed.indices, pointer),
-            shape=(len(wide), self.sensed.shape[1]),
-        )
+        # Path k has its rows from k (t_max + 1 + more) on.
+        more, rows = int(self.waits.max()), row_index(self.sensed)
+        place = (rows + rows // self.choices * more, self.sensed.indices)
+        shape = (len(self.start) * (self.choices + more), self.sensed.shape[1])
+        sensed = sparse.csr_array((self.sensed.data, place), shape=shape)
         return replace(self, misses=self.misses + self.waits, sensed=sensed)
 
 
@@ -247,24 +244,18 @@ class SensedPaths:
 
     def state_dict(self) -> dict[str, Any]:
         """All that was observed."""
-        numbers = {
-            "sizes": np.array([len(part.start) for part in self._parts], dtype=np.int64),
-            "waiting": self._waiting,
-            "running": self._running,
-            "next": self._next,
+        numbers = {"waiting": self._waiting, "running": self._running, "next": self._next}
+        return tensors(numbers) | {
+            "parts": [tensors(as_arrays(vars(part))) for part in self._parts]
         }
-        paths = _Sensed.of(self._parts, self._task.num_cells)
-        return tensors(as_arrays(numbers | vars(paths)))
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
-        parts = from_arrays(arrays(state))
-        self._waiting, self._running = parts.pop("waiting"), parts.pop("running")
-        self._next, ends = parts.pop("next"), np.cumsum(parts.pop("sizes"))
-        paths = _Sensed(**parts)
-        places = np.split(np.arange(len(paths.start)), ends[:-1]) if len(ends) else []
-        self._parts = [paths.pick(place) for place in places]
-        self._tracks = None
+        self._parts = [_Sensed(**from_arrays(arrays(part))) for part in state["parts"]]
+        self._waiting, self._running = (
+            state[name].cpu().numpy() for name in ("waiting", "running")
+        )
+        self._next, self._tracks = int(state["next"]), None
 
 
 def _missed(paths: ObservedPaths) -> Missed:

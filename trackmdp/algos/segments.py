@@ -43,12 +43,10 @@ class SegmentBuffer(Checkpointed):
         generator: torch.Generator,
         judge: int | None = None,
     ) -> None:
-        self.num_cells = task.num_cells
         self.steps = steps
         self.judge = judge
         self._generator = generator
-        self._keys = task.keys if task.order else None
-        self._outside = self._keys.num_keys if self._keys else task.num_cells
+        self._keys = task.keys
         self._paths = SensedPaths(task, capacity)
         self._drawn_from: Tensor | None = None
 
@@ -62,9 +60,9 @@ class SegmentBuffer(Checkpointed):
 
     def moves(self) -> tuple[Tensor, Tensor]:
         """Cells, or keys of them, before and after every step, int64 `[K]` each; M after an exit."""
-        classes, device = self._outside // self.num_cells, self._generator.device
         start, end = (
-            torch.as_tensor(part, device=device) * classes for part in self._paths.moves()
+            torch.as_tensor(part * self._keys.num_classes, device=self._generator.device)
+            for part in self._paths.moves()
         )
         return start, end
 
@@ -79,22 +77,20 @@ class SegmentBuffer(Checkpointed):
         first, last = (
             np.repeat(ends, lengths) for ends in (tracks.first[:-1], tracks.first[1:] - 1)
         )
-        line, cells = tracks.cells, []
-        if self._keys:
-            # A key depends on the last detections alone: it equals the key of a path that began so many steps before.
-            line = self._keys.start(tracks.cells[np.maximum(place - self._keys.order, first)])
-            for back in range(self._keys.order - 1, -1, -1):
-                following = self._keys.next(line, 0, tracks.cells[np.maximum(place - back, 0)])
-                line = np.where(place - back > first, following, line)
+        # A key depends on the last detections alone: it equals the key of a path that began so many steps before.
+        keys, cells = self._keys, []
+        line = keys.start(tracks.cells[np.maximum(place - keys.order, first)])
+        for back in range(keys.order - 1, -1, -1):
+            following = keys.next(line, 0, tracks.cells[np.maximum(place - back, 0)])
+            line = np.where(place - back > first, following, line)
         for step in range(self.steps + 1):
             gone = place + step > last
-            cells.append(np.where(gone, self._outside, np.roll(line, -step)))
+            cells.append(np.where(gone, keys.num_keys, np.roll(line, -step)))
         whole = ~gone | np.repeat(tracks.exits, lengths)
         if not whole.any():  # all recordings stop early; they count as if the target left there
             whole = last > place
-        return torch.as_tensor(np.stack(cells)[:, whole]).to(
-            self._generator.device, cell_dtype(self._outside)
-        )
+        kind = cell_dtype(keys.num_keys)
+        return torch.as_tensor(np.stack(cells)[:, whole]).to(self._generator.device, kind)
 
     def sample(self, count: int) -> Tensor:
         """`[steps + 1, count]` int64, segments drawn as they are, each as likely as any other."""
@@ -118,8 +114,6 @@ class InferredMoves(MoveBuffer):
         generator: draws the paths; they come on its device.
     """
 
-    parts: ClassVar[tuple[str, ...]] = ("_estimate",)
-
     def __init__(self, task: Task, generator: torch.Generator) -> None:
         super().__init__(task, 0, generator)
         self._task, modes = task, task.keys.num_classes
@@ -140,23 +134,31 @@ class InferredMoves(MoveBuffer):
     def moves(self) -> tuple[Tensor, Tensor]:
         """Cells before and after every move that may have been made, int64 `[K]` each."""
         self._index = self._index or self._sort()
-        counts, device = self._estimate.counts, self._generator.device
-        start, end = (
-            torch.as_tensor(part, device=device).long()
-            for part in (row_index(counts), counts.indices)
-        )
+        start, end, _ = self._counts()
         return start, end
+
+    def _counts(self) -> tuple[Tensor, ...]:
+        """Starts, ends and numbers of the expected moves."""
+        counts, device = self._estimate.counts, self._generator.device
+        parts = (row_index(counts), counts.indices.astype(np.int64), counts.data)
+        return tuple(torch.as_tensor(part, device=device) for part in parts)
 
     def _sort(self) -> tuple[Tensor, CellIndex]:
         """All ends in the order of (start, end), and where those of each cell are, weighted by expected numbers."""
-        estimate, device = self._estimate, self._generator.device
+        estimate = self._estimate
         # From the moves seen alone: the result does not depend on when it was asked for before.
         estimate.counts = estimate.direct
         estimate.fit(EM_ROUNDS)
         estimate.counts.sort_indices()
-        start, end, weights = (
-            torch.as_tensor(part, device=device)
-            for part in (row_index(estimate.counts), estimate.counts.indices, estimate.counts.data)
-        )
-        ends = torch.cat([end.long(), end.new_tensor([self.num_cells]).long()])
-        return ends, CellIndex.of(start.long(), self.num_cells, weights)
+        start, end, weights = self._counts()
+        ends = torch.cat([end, end.new_tensor([self.num_cells])])
+        return ends, CellIndex.of(start, self.num_cells, weights)
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that was observed."""
+        return self._estimate.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a `state_dict`."""
+        self._estimate.load_state_dict(state)
+        self._index = None

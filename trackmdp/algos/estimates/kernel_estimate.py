@@ -11,10 +11,10 @@ the moves of the prior, which puts the displacements seen anywhere down at every
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 from scipy import sparse
-from torch import Tensor
 
 from trackmdp.algos.common import arrays, tensors
 from trackmdp.algos.estimates.alike import AlikeCells
@@ -104,20 +104,23 @@ class KernelEstimate:
         self.direct = self.direct + ones_at(start, end, self.direct.shape, np.float64)
         self.counts = self.direct if unfitted else self.counts
 
-    def state_dict(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Any]:
         """All that was observed, and the counts so far; none before the first fit."""
-        parts = {"direct": self.direct} | vars(ObservedPaths.of(self._censored, self.num_cells))
-        fitted = {} if self.counts is self.direct else {"counts": self.counts}
-        return tensors(as_arrays(parts | fitted))
+        parts = {"direct": self.direct}
+        if self.counts is not self.direct:
+            parts["counts"] = self.counts
+        censored = [tensors(as_arrays(vars(part))) for part in self._censored]
+        return tensors(as_arrays(parts)) | {"censored": censored}
 
-    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a `state_dict`."""
-        parts = from_arrays(arrays(state))
-        self.direct = parts.pop("direct")
+        parts = dict(state)
+        self._censored = [
+            ObservedPaths(**from_arrays(arrays(each))) for each in parts.pop("censored")
+        ]
+        self.direct = (matrices := from_arrays(arrays(parts)))["direct"]
         # Without counts of their own, moves that are added count at once (`add_moves`).
-        self.counts = parts.pop("counts", self.direct)
-        paths = ObservedPaths(**parts)
-        self._censored = [paths] if len(paths.start) else []
+        self.counts = matrices.get("counts", self.direct)
 
     def fit(self, rounds: int) -> None:
         """Run rounds of expectation-maximisation on the censored paths, from the kernel estimated so far.
