@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from trackmdp.arrays.entries import blocks
+from trackmdp.arrays.entries import block_rows
 from trackmdp.arrays.types import AnyArray, IndexArray
 from trackmdp.config import TrainConfig
 from trackmdp.config.registry import maker
@@ -149,7 +149,7 @@ def lifted(task: Task, table: PolicyTable) -> PolicyTable:
     keys = np.arange(task.num_keys)
     known = task.keys.cell(keys) * task.revealed + keys % task.revealed
     assert table.sets is not None
-    return PolicyTable(task, table.sets[blocks(known, task.num_choices)])
+    return PolicyTable(task, table.sets[block_rows(known, task.num_choices)])
 
 
 def choosable_places(task: Task, located: IndexArray, sensors: IndexArray) -> IndexArray:

@@ -101,14 +101,7 @@ class HindsightLoss(nn.Module):
         self.discount = discount
         entries = max(self.sensors.entries, self.near.width * self._keys.modes)
         self._keys_at_once = max(1, max_entries // (choices * entries))
-        self.safe_cost = task.safe_cost / task.reward
-        # Reward of the forced step, in units of r: (r - D) / r; or about the sum of all until one locates.
-        safe = float(task.safe_detection.mean())
-        self._forced = (safe - self.safe_cost) / (1.0 - discount * (1.0 - safe))
-        # p_s [M + 1], known to the learner like the prices; 0 outside, and no state: it is the task's.
-        locates = torch.as_tensor(task.safe_detection, dtype=torch.float32, device=device)
-        every = pad(locates.repeat_interleave(self._classes), (0, 1))
-        self._safe_detection = None if task.safe else every
+        self._keep_safe_action()
         self.clocks = nn.Buffer(torch.arange(choices, device=device).unsqueeze(-1))
         # Row 0 for the clocked actor, row 1 for the actor.
         self.gain_scale = nn.Buffer(torch.ones(2, choices, device=device))
@@ -141,6 +134,20 @@ class HindsightLoss(nn.Module):
         self.critic = net(1 if task.safe else 2, outputs=1)
         self.clocked_actor = decisions(self.near, self.nearby)
         self.clocked_critic = net(choices + 1, outputs=1)
+
+    def _keep_safe_action(self) -> None:
+        """D and the reward of the forced step, in units of r, and p_s."""
+        task = self._task
+        self.safe_cost = task.safe_cost / task.reward
+        # (r - D) / r; or about the sum of all forced steps until one locates.
+        safe = float(task.safe_detection.mean())
+        self._forced = (safe - self.safe_cost) / (1.0 - self.discount * (1.0 - safe))
+        # [M + 1], known to the learner like the prices; 0 outside, and no state: it is the task's.
+        locates = torch.as_tensor(task.safe_detection, dtype=torch.float32).to(
+            self.near.cells.device
+        )
+        every = pad(locates.repeat_interleave(self._classes), (0, 1))
+        self._safe_detection = None if task.safe else every
 
     def parts(self, cells: Tensor, on: Tensor, blend: float) -> Iterator[dict[str, Tensor]]:
         """The losses, a few located cells at a time; the critics' come with the last part.
@@ -326,11 +333,7 @@ class HindsightLoss(nn.Module):
         reports, inside = gather(found, entry) * seen.float(), moves < m
         # Set costs are computed once per (x, n) and looked up by the paths, however many there are.
         spent = gather(prices, row)
-        if replay is None:
-            located = gather(pad(value[:, 0], (0, 1)), own[1:])
-        else:
-            terms = {"safe_cost": self.safe_cost, "discount": self.discount}
-            located = replay.worth(cells, own, prices, value[:, 0], **terms)
+        located = self._located(replay, cells, own, prices, value[:, 0])
         returns = self._returns((reports, inside, spent, located), moves[-1], value)
         # advantage is [T + 1, M + 1]: entry (n, y) is n (M + 1) + y.
         clocked = gather(advantage, self.clocks * (m + 1) + end)
@@ -358,6 +361,15 @@ class HindsightLoss(nn.Module):
         # Where the target has left the grid or the view, `entry` is some other sensor's.
         local, width = self.view.find(located_in, there), self.view.width
         return row, row * width + local.clamp_max(width - 1), local < width
+
+    def _located(
+        self, replay: Replay | None, cells: Tensor, own: Tensor, prices: Tensor, value: Tensor
+    ) -> Tensor:
+        """`[T+2, B]`, the value of a detection at each step."""
+        if replay is None:
+            return gather(pad(value, (0, 1)), own[1:])
+        terms = {"safe_cost": self.safe_cost, "discount": self.discount}
+        return replay.worth(cells, own, prices, value, **terms)
 
     def _returns(self, steps: tuple[Tensor, ...], end: Tensor, value: Tensor) -> Tensor:
         """The returns of chains (`chain_returns`) that end with the safe action, the target then in `end` `[B]`."""

@@ -61,7 +61,7 @@ def padded_rows(
     return columns, numbers
 
 
-def blocks(places: IndexArray, size: int) -> IndexArray:
+def block_rows(places: IndexArray, size: int) -> IndexArray:
     """The rows of blocks of `size` rows each: of the blocks 3 and 1, with two rows, they are 6 7 2 3."""
     return (places[:, None] * size + np.arange(size)).ravel()
 

@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.entries import blocks, row_index
+from trackmdp.arrays.entries import block_rows, row_index
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 
 _AT_ONCE = 2**14
@@ -52,7 +52,7 @@ class ObservedPaths:
     def pick(self, paths: IndexArray) -> Self:
         """The `paths` of these numbers, in their order."""
         # With t_max = 1, path 3 has the rows 3 * 2 + (0, 1) = 6, 7.
-        rows = blocks(paths, self.choices)
+        rows = block_rows(paths, self.choices)
         columns = {name: part[paths] for name, part in vars(self).items() if name != "sensed"}
         return replace(self, sensed=self.sensed[rows], **columns)
 

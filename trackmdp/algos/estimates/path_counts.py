@@ -16,7 +16,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.algos.estimates.path_gains import AlongPaths, Paths
-from trackmdp.arrays.entries import among, blocks, ones_at, per_row, summing
+from trackmdp.arrays.entries import among, block_rows, ones_at, per_row, summing
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.grid.displacements import apart, cell_at, displacement
 from trackmdp.memory.keys import KeySpace
@@ -81,7 +81,7 @@ class KeyPlans:
         assert sets is not None
 
         def rows(keys: IndexArray) -> sparse.csr_array:
-            return sets[blocks(keys, task.num_choices)]
+            return sets[block_rows(keys, task.num_choices)]
 
         return cls(keys, SetTable(task, rows(keys), len(keys)), rows)
 
@@ -89,11 +89,11 @@ class KeyPlans:
         """The same policy with plans of other `keys`, in their order."""
         task, (place, known) = self.table.task, among(self.keys, keys)
         assert self.table.sets is not None
-        own = self.table.sets[blocks(place[known], task.num_choices)]
+        own = self.table.sets[block_rows(place[known], task.num_choices)]
         both = sparse.vstack([own, self.others(keys[~known])], format="csr")
         # Rows of the known keys, then those of the others, are brought into the order of `keys`.
         order = np.argsort(~known, kind="stable").argsort()
-        sets = both[blocks(order, task.num_choices)]
+        sets = both[block_rows(order, task.num_choices)]
         return KeyPlans(keys, SetTable(task, sets, len(keys)), self.others)
 
     def policy(self) -> PolicyTable:
