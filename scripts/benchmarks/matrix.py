@@ -8,16 +8,14 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TypeAlias
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import trackmdp as tm
 from benchmarks.words import Row
 from trackmdp.errors import UserError
-
-Case: TypeAlias = Callable[[], tuple[tm.World, Any]]
-"""Makes the world in which policies are valued, and the problem to learn: the same world, or tracks recorded in it."""
 
 LEARNERS = ("model_based", "hindsight", "a2c_per_sensor", "ppo_per_sensor", "dqn_per_sensor")
 JOINT = ("a2c", "ppo", "dqn")
@@ -38,15 +36,15 @@ def rows(
     `mean` and `worst` are regrets per step to the best policy known: of the solver, or of a run. `solver` is the regret
     of the solver's policy to it. A learner that refuses a world has its message in place of figures.
     """
-    for name, make in cases(size, hidden_size).items():
+    for name, case in cases(size, hidden_size).items():
         if worlds and not any(word in name for word in worlds):
             continue
-        world, problem = make()
+        world, problem = case.made()
         began = time.process_time()
         best = known(world)
         seconds = time.process_time() - began
         found = {
-            algo: _runs(world, problem, algo, seeds[:1] if algo in JOINT else seeds, device)
+            algo: runs_of(world, problem, algo, seeds[:1] if algo in JOINT else seeds, device)
             for algo in algos
         }
         values = [best, *(value for each in found.values() for value in each["values"])]
@@ -65,7 +63,7 @@ def rows(
             }
 
 
-def _runs(
+def runs_of(
     world: tm.World, problem: Any, algo: str, seeds: tuple[int, ...], device: str
 ) -> dict[str, Any]:
     """The AIHTR of each run, CPU seconds and steps of an episode."""
@@ -88,6 +86,30 @@ def known(world: tm.World) -> float:
     """The AIHTR of the policy that the solver finds."""
     found = tm.solve(world.but(max_steps=None))  # whole episodes are solved
     return float(tm.evaluate(world, found.policy).aihtr)
+
+
+class Case(NamedTuple):
+    """One kind of world.
+
+    Attributes:
+        make: makes a world.
+        changes: of its task.
+        recorded: whether it is learned from tracks that are recorded in it.
+    """
+
+    make: Callable[..., tm.World]
+    changes: Mapping[str, Any] = MappingProxyType({})
+    recorded: bool = False
+
+    def made(self) -> tuple[tm.World, Any]:
+        """The world in which policies are valued, and the problem to learn: the same world, or its tracks."""
+        # With other prices, D is their sum unless it is given.
+        changes = ({"safe_cost": None} if "cost" in self.changes else {}) | dict(self.changes)
+        own = {name: value for name, value in changes.items() if name != "markov"}
+        world = self.make()
+        problem = _tracks_of(world) if self.recorded else None
+        world = world.but(**own)
+        return world, world if problem is None else replace(problem, **changes)
 
 
 def cases(size: int, hidden_size: int) -> dict[str, Case]:
@@ -116,12 +138,12 @@ def cases(size: int, hidden_size: int) -> dict[str, Case]:
         "footprints, window 1": footprints(size) | {"window": 1},
         "memory without modes": {"memory": "displacement"},
     }
-    found: dict[str, Case] = {name: _same(base, more) for name, more in plain.items()}
-    found["border exit"] = _same(partial(base, border="exit"), {})
-    found["far jumps"] = _same(partial(_jumping, size), {})
-    found["drift .7, c .3"] = _same(partial(base, "drift", persistence=0.7), {"cost": 0.3})
-    found["walk, c .4"] = _same(partial(base, "random_walk"), {"cost": 0.4})
-    found["3 x 5 cells"] = _same(partial(tm.make_world, size=(3, 5)), {})
+    found: dict[str, Case] = {name: Case(base, more) for name, more in plain.items()}
+    found["border exit"] = Case(partial(base, border="exit"))
+    found["far jumps"] = Case(partial(_jumping, size))
+    found["drift .7, c .3"] = Case(partial(base, "drift", persistence=0.7), {"cost": 0.3})
+    found["walk, c .4"] = Case(partial(base, "random_walk"), {"cost": 0.4})
+    found["3 x 5 cells"] = Case(partial(tm.make_world, size=(3, 5)))
     return found | _hidden(hidden_size)
 
 
@@ -135,7 +157,7 @@ def _hidden(size: int) -> dict[str, Case]:
     found: dict[str, Case] = {}
     memories = ("cell", "displacement", "displacement_gap", "two_displacements")
     for memory in memories:
-        found[f"heading, {memory}"] = _same(heading, {"memory": memory})
+        found[f"heading, {memory}"] = Case(heading, {"memory": memory})
     remembers = {"memory": "displacement"}
     for name, more in {
         "miss .8": {"detection": 0.8},
@@ -147,20 +169,20 @@ def _hidden(size: int) -> dict[str, Case]:
         "footprints, miss .8": wide | {"detection": 0.8},
         "a cell without a sensor": holes,
     }.items():
-        found[f"heading, displacement, {name}"] = _same(heading, remembers | more)
-        found[f"heading told, {name}"] = _same(told, more)
-    found["heading, cell, miss .8"] = _same(heading, {"detection": 0.8})
-    found["heading told"] = _same(told, {})
-    found["regimes, displacement_gap"] = _same(
+        found[f"heading, displacement, {name}"] = Case(heading, remembers | more)
+        found[f"heading told, {name}"] = Case(told, more)
+    found["heading, cell, miss .8"] = Case(heading, {"detection": 0.8})
+    found["heading told"] = Case(told)
+    found["regimes, displacement_gap"] = Case(
         partial(tm.make_world, "regimes", size=size, **regimes), {"memory": "displacement_gap"}
     )
     moving = partial(tm.make_world, "constant_velocity", size=size)
-    found["constant velocity, displacement"] = _same(moving, remembers)
-    found["coordinated turn told"] = _same(
-        partial(tm.make_world, "coordinated_turn", size=size, reveals=True), {}
+    found["constant velocity, displacement"] = Case(moving, remembers)
+    found["coordinated turn told"] = Case(
+        partial(tm.make_world, "coordinated_turn", size=size, reveals=True)
     )
     for memory in memories:
-        found[f"tracks, {memory}"] = partial(_recorded, heading, {"memory": memory})
+        found[f"tracks, {memory}"] = Case(heading, {"memory": memory}, recorded=True)
     for name, more in {
         "cell, miss .8": {"detection": 0.8},
         "displacement, miss .8": remembers | {"detection": 0.8},
@@ -169,51 +191,29 @@ def _hidden(size: int) -> dict[str, Case]:
         "displacement, max_steps 30": remembers | {"max_steps": 30},
         "displacement, a cell without a sensor": remembers | holes,
     }.items():
-        found[f"tracks, {name}"] = partial(_recorded, heading, more)
+        found[f"tracks, {name}"] = Case(heading, more, recorded=True)
     walk = partial(tm.make_world, size=size)
-    found["tracks, markov"] = partial(_recorded, walk, {"markov": True})
-    found["tracks, markov, miss .8"] = partial(_recorded, walk, {"markov": True, "detection": 0.8})
-    found["tracks, markov, displacement"] = partial(_recorded, walk, {"markov": True} | remembers)
+    found["tracks, markov"] = Case(walk, {"markov": True}, recorded=True)
+    found["tracks, markov, miss .8"] = Case(walk, {"markov": True, "detection": 0.8}, recorded=True)
+    found["tracks, markov, displacement"] = Case(walk, {"markov": True} | remembers, recorded=True)
     return found
 
 
-def _same(make: Callable[..., tm.World], changes: Mapping[str, Any]) -> Case:
-    """A world to learn in, and to value in."""
-
-    def made() -> tuple[tm.World, tm.World]:
-        world = make().but(**_priced(changes))
-        return world, world
-
-    return made
-
-
-def _priced(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """The changes; with other prices, D is their sum unless it is given."""
-    return ({"safe_cost": None} if "cost" in changes else {}) | dict(changes)
-
-
-def _recorded(
-    make: Callable[..., tm.World], changes: Mapping[str, Any], tracks: int = 3_000
-) -> tuple[tm.World, Any]:
-    """Tracks of a world, to learn from, and that world."""
-    world = make()
+def _tracks_of(world: tm.World) -> Any:
+    """Tracks that are recorded in a world."""
     with TemporaryDirectory() as folder:
         file = Path(folder) / "tracks.csv"
-        write_tracks(file, world, tracks)
-        options = {"t_max": world.t_max, "min_length": 1}
-        problem = tm.load_tracks(file, world.size, **options)
-    changes = _priced(changes)
-    own = {name: value for name, value in changes.items() if name != "markov"}
-    return world.but(**own), replace(problem, **changes)
+        write_tracks(file, world, 3_000)
+        return tm.load_tracks(file, world.size, t_max=world.t_max, min_length=1)
 
 
-def write_tracks(file: Path, world: tm.World, count: int, *, longest: int | None = None) -> None:
-    """Write `count` tracks of the target, from any state to its exit, or `longest` cells of it, as a .csv file."""
+def write_tracks(file: Path, world: tm.World, count: int) -> None:
+    """Write `count` tracks of the target, from any state to its exit, as a .csv file."""
     rng = np.random.default_rng(0)
     kernel, states = world.kernel, world.num_states
     state, name = rng.integers(states, size=count), np.arange(count)
     lines, step = [], 0
-    while len(state) and (longest is None or step < longest):
+    while len(state):
         lines.append(np.column_stack([name, np.full(len(name), step), state // world.modes]))
         sums = np.concatenate([[0.0], np.cumsum(kernel.data)])
         drawn = sums[kernel.indptr[state]] + rng.random(len(state))

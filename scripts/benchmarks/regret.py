@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 import trackmdp as tm
+from benchmarks.matrix import runs_of
 from benchmarks.spreading import worlds as spreading_worlds
 from benchmarks.words import Row, world_of
 
@@ -33,14 +34,8 @@ def rows(
         best = tm.solve(world, nodes=nodes)
         solved = time.process_time() - started
         length = best.evaluation.expected_length
-        earned: dict[str, np.ndarray] = {}
-        spent: dict[str, float] = {}
-        for algo in algos:
-            started = time.process_time()
-            options = {"optimal.enabled": False, "device": device}
-            runs = [tm.train(world, algo, seed=seed, **options) for seed in seeds]
-            spent[algo] = (time.process_time() - started) / len(runs)
-            earned[algo] = np.array([run.evaluation.aihtr for run in runs])
+        runs = {algo: runs_of(world, world, algo, seeds, device) for algo in algos}
+        earned = {algo: np.array(each["values"]) for algo, each in runs.items()}
         known = max(best.lower, *(each.max() for each in earned.values()))
         for algo, each in earned.items():
             yield {
@@ -52,6 +47,6 @@ def rows(
                 "mean": (best.upper - each.mean()) / length,
                 "worst_to_best": (known - each.min()) / length,
                 "bracket": (best.upper - best.lower) / length,
-                "cpu_seconds_a_run": spent[algo],
+                "cpu_seconds_a_run": runs[algo]["seconds"],
                 "solver_seconds": solved,
             }

@@ -172,7 +172,7 @@ def learner(env: Env, optimizer: optax.GradientTransformation) -> Any:
 
 def main() -> None:
     """Learn until the time is up."""
-    words = track.arguments(__doc__)
+    words = track.arguments(__doc__).parse_args()
     at = track.Instance(words.instance)
     env = Env(at)
     record = track.Record(words.record, words.seconds)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -36,17 +35,14 @@ def _sets(trainer: Training) -> np.ndarray:
 
 def main() -> None:
     """Learn to the end."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("instance")
-    parser.add_argument("record")
-    parser.add_argument("--seed", type=int, default=0)
+    parser = track.arguments(__doc__)
     parser.add_argument("--algo", default="hindsight")
     words = parser.parse_args()
     with np.load(words.instance, allow_pickle=False) as stored:
         given = {name: stored[name] for name in ("kernel", "cost")}
         rest = {name: stored[name].tolist() for name in ("size", "safe_cost", "reward", "t_max")}
     world = tm.World(**given, **rest)
-    record = track.Record(words.record, seconds=float("inf"))
+    record = track.Record(words.record, seconds=float("inf"))  # of a default budget all is recorded
     # No evaluation but the last, and no optimum: they are not learning.
     own = {"evaluation.every": 10**9, "optimal.enabled": False, "threads": 1}
     tm.train(world, words.algo, seed=words.seed, callbacks=[Kept(record)], **own)

@@ -107,7 +107,7 @@ class Keep(BaseCallback):
 
 def main() -> None:
     """Learn until the time is up."""
-    words = track.arguments(__doc__)
+    words = track.arguments(__doc__).parse_args()
     torch.set_num_threads(1)
     instance = track.Instance(words.instance)
     updates = FALL / (ENVS * STEPS)

@@ -92,11 +92,11 @@ class Record:
         )
 
 
-def arguments(about: str | None) -> argparse.Namespace:
-    """The words that every peer takes."""
+def arguments(about: str | None) -> argparse.ArgumentParser:
+    """The parser of the words that every peer takes."""
     parser = argparse.ArgumentParser(description=about)
     parser.add_argument("instance", help="INSTANCE.npz, written by scripts/benchmark.py part=peers")
     parser.add_argument("record", help="RECORD.npz, to be written")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=120.0, help="of learning")
-    return parser.parse_args()
+    return parser

@@ -7,9 +7,10 @@ import html
 import io
 from collections.abc import Sequence
 from importlib.util import find_spec
+from itertools import cycle
 from typing import Any
 
-from numpy import isnan
+from numpy import asarray, isnan
 
 from trackmdp.errors import require
 from trackmdp.notebook.pictures import Heat, Picture
@@ -66,17 +67,13 @@ def _lines(picture: Any, axes: Any) -> None:
 
     for name, heights in picture.lines.items():
         # A line through the measurements: between two evaluations there is nothing.
-        points = [
-            (x, y) for x, y in zip(picture.x, heights, strict=True) if y == y
-        ]  # nan differs from itself
-        if points:
-            axes.plot(*zip(*points, strict=True), color=BLUE, marker=".", label=name)
-    for place, (name, height) in enumerate(picture.levels.items()):
-        style = {
-            "color": (ORANGE, INK, "#5c5c5d")[place % 3],
-            "linestyle": ("-", "--", ":")[place % 3],
-        }
-        axes.axhline(height, linewidth=1.2, label=name, **style)
+        known = ~isnan(heights)
+        if known.any():
+            x = asarray(picture.x)[known]
+            axes.plot(x, asarray(heights)[known], color=BLUE, marker=".", label=name)
+    looks = cycle(((ORANGE, "-"), (INK, "--"), ("#5c5c5d", ":")))
+    for (name, height), (color, style) in zip(picture.levels.items(), looks, strict=False):
+        axes.axhline(height, linewidth=1.2, label=name, color=color, linestyle=style)
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.xaxis.set_major_formatter("{x:,g}")
     axes.set_xlabel(picture.labels[0])
