@@ -10,7 +10,7 @@ import pytest
 import trackmdp as tm
 from tests.helpers import small_world
 from tests.tracks import by_hand
-from trackmdp.episodes.group_episode import GroupEpisode
+from trackmdp.episodes.episode import Episode
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.world.group import Group
@@ -124,7 +124,7 @@ def test_gospa_of_two_targets_by_hand() -> None:
 
     The first target walks 0 > 1 > 2, missed and then located; the second stays in 8, located, and leaves.
     """
-    episode = GroupEpisode(
+    episode = Episode(
         *(0, 0, 0),
         start=np.array([0, 8]),
         misses=np.array([[0, 0], [1, 0]]),

@@ -10,6 +10,7 @@ import numpy as np
 from tests.helpers import limited, small_world
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.schema import TABLES
 from trackmdp.episodes.simulate import simulate
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.policies.policy import Policy
@@ -56,7 +57,7 @@ def write(
 def rewritten(source: Path, target: Path) -> Path:
     """The log read whole and written anew."""
     with EpisodeReader(source) as reader:
-        tables = {name: reader.attachment(name) for name in reader.run.tables}
+        tables = {name: reader.attachment(name) for name in TABLES}
         writer = EpisodeWriter(target, reader.run, tables)
         for number, facts in enumerate(reader.policies):
             plain = {key: value for key, value in facts.items() if not key.startswith("table")}

@@ -15,7 +15,8 @@ from mcap.opcode import Opcode
 
 from tests.episodes.logs import CONFIG, WORLD, policy, recorded, write
 from trackmdp.episodes import container
-from trackmdp.episodes.episode import Episode, first_difference
+from trackmdp.episodes.differences import first_difference
+from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
 from trackmdp.episodes.writer import EpisodeWriter

@@ -17,9 +17,9 @@ from tests.episodes.logs import WORLD, recorded, write
 from tests.helpers import train_config
 from tests.tracks import by_hand
 from tests.tracks import recorded as recorded_tracks
+from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.episode_page import MOST_STEPS, page
 from trackmdp.episodes.extracts import write_page
-from trackmdp.episodes.group_episode import GroupEpisode
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.simulate import resimulate, simulate
 from trackmdp.errors import UserError
@@ -170,7 +170,7 @@ def test_the_page_in_a_browser(reader: EpisodeReader, tmp_path: Path) -> None:
         assert browser.problems == []
 
 
-def a_page_of(targets: int, tmp_path: Path) -> tuple[GroupEpisode, Path]:
+def a_page_of(targets: int, tmp_path: Path) -> tuple[Episode, Path]:
     """An episode of several targets of 15 steps or more, on a page made by its log and by `page` alike."""
     world = tm.make_world("random_walk", size=(3, 5), exit_probability=0.05, cost=0.3)
     found = tm.simulate(tm.Group([world] * targets), "optimal", 30)

@@ -16,13 +16,13 @@ from tests.episodes.logs import CONFIG, rewritten
 from tests.solvers.test_group import tiny
 from trackmdp.app.cli import main
 from trackmdp.episodes.belief_filter import beliefs
-from trackmdp.episodes.episode import first_difference
-from trackmdp.episodes.group_episode import GroupEpisode
+from trackmdp.episodes.differences import first_difference
+from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.group_episodes import GroupEpisodes
-from trackmdp.episodes.group_simulate import group_episodes
 from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
 from trackmdp.episodes.schema import LoggedRun
+from trackmdp.episodes.simulate import resimulate
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
 from trackmdp.solvers.several.group_tracker import GroupTracker
@@ -46,11 +46,11 @@ GROUP = missing()
 RULE = rule_of(GROUP)
 
 
-def played(count: int, *, rule: Rule = RULE, seed: int = 0) -> list[GroupEpisode]:
+def played(count: int, *, rule: Rule = RULE, seed: int = 0) -> list[Episode]:
     return list(tm.simulate(rule.group, rule, count, seed=seed).complete())
 
 
-def write(file: Path, episodes: list[GroupEpisode], rule: Rule = RULE) -> Path:
+def write(file: Path, episodes: list[Episode], rule: Rule = RULE) -> Path:
     writer = EpisodeWriter.of(file, rule.group, facts={"seed": "0"}, config=CONFIG)
     writer.add_policy({"label": "mine"}, rule)
     for episode in episodes:
@@ -65,7 +65,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_an_episode_depends_on_its_own_seed_alone() -> None:
     episodes = tm.simulate(GROUP, RULE, 30, seed=1)
-    again = group_episodes(RULE, episodes.seeds[17:18], beliefs=True)[0]
+    again = next(resimulate(GROUP, RULE, episodes.seeds[17:18]).complete())
     assert first_difference(list(episodes.complete())[17], replace(again, number=17)) is None
     other = tm.simulate(GROUP, RULE, 30, seed=2)
     assert [len(each) for each in other] != [len(each) for each in episodes]
@@ -156,7 +156,7 @@ def test_steps_are_as_the_environment_has_them() -> None:
     # Sensor t is on in step t; the safe action in step 2, after which the history is empty.
     misses, action = np.array([[0], [1], [2], [0]]), np.eye(4, 3, dtype=bool)
     located, target = np.array([[False], [False], [True], [False]]), np.array([[0], [1], [2], [3]])
-    episode = GroupEpisode(
+    episode = Episode(
         0, 0, 0, np.array([0]), misses, action, target, located, np.zeros(4, np.float32), True
     )
     steps = episode.to_tensordict(tiny(0, t_max=1))
@@ -261,13 +261,21 @@ def test_a_cut_log_gives_back_its_whole_episodes(log: Path, tmp_path: Path) -> N
     )
 
 
-@pytest.mark.parametrize("said", ["x", "1 0", "0 2", "-1", "0 0 3 1", "0 " * 1001])
-def test_targets_of_motions_that_are_not_there_are_damage(said: str, log: Path) -> None:
+@pytest.mark.parametrize("said", ["x", "0 " * 1001])
+def test_targets_that_are_none_or_too_many_are_damage(said: str, log: Path) -> None:
     with EpisodeReader(log) as reader:
         facts = reader.run.said | {"targets": said}
     assert LoggedRun(Path("a.mcap"), facts | {"targets": "0 " * 1000}).kinds == (0,) * 1000
     with pytest.raises(UserError, match="not a log of trackmdp"):
         LoggedRun(Path("a.mcap"), facts)
+
+
+@pytest.mark.parametrize("kinds", [(1, 0), (0, 2, 0), (-1,), (0, 0, 3, 1), ()])
+def test_targets_of_motions_that_are_not_there_are_damage(kinds: tuple[int], log: Path) -> None:
+    with EpisodeReader(log) as reader:
+        reader.run.kinds = kinds
+        with pytest.raises(UserError, match="problem"):
+            reader.world()
 
 
 def test_steps_of_other_targets_are_damage(log: Path) -> None:

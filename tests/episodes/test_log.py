@@ -19,7 +19,7 @@ from tests.tracks import by_hand, digest_of
 from tests.tracks import recorded as recorded_tracks
 from trackmdp.environment.env import TrackEnv
 from trackmdp.episodes import schema
-from trackmdp.episodes.episode import first_difference
+from trackmdp.episodes.differences import first_difference
 from trackmdp.episodes.episode_page import page
 from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover

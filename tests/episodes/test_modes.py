@@ -14,7 +14,8 @@ import pytest
 
 from tests.typed import refused
 from trackmdp.app.cli import main
-from trackmdp.episodes.episode import Episode, first_difference
+from trackmdp.episodes.differences import first_difference
+from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
 from trackmdp.episodes.sentences import mode_words

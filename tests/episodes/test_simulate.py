@@ -20,7 +20,8 @@ from tests.tracks import recorded as recorded_tracks
 from trackmdp.environment.dynamics import Dynamics
 from trackmdp.environment.env import TrackEnv
 from trackmdp.environment.paths import path_sampler
-from trackmdp.episodes.episode import Episode, first_difference
+from trackmdp.episodes.differences import first_difference
+from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.sentences import sentence
 from trackmdp.episodes.simulate import episode_seeds, resimulate, simulate
 from trackmdp.errors import UserError
@@ -308,8 +309,9 @@ def test_episodes_that_do_not_fit_are_refused_before_any_is_kept(problem: Any) -
 
 def test_the_size_of_episodes_is_that_of_their_arrays() -> None:
     two = simulate(Group([WORLD, WORLD]), "none", 2)
-    names = ("start", "misses", "action", "target", "located", "reward")
-    assert two.nbytes == sum(getattr(each, name).nbytes for each in two for name in names)
+    # Two targets' misses and cells of four bytes, sensors and reward of four, located of two targets and truncated of
+    # one, and 16 bits of sensors; starts of both, and where each begins.
+    assert two.nbytes == (16 + 8 + 3 + 2) * len(two.target) + 8 * (4 + 3)
     one = simulate(WORLD, "none", 9)
     # Misses, target, sensors, reward of four bytes, located and truncated of one; start, its mode, and where it begins.
     assert one.nbytes == 18 * len(one.target) + 8 * (9 + 9 + 10)

@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from tests.episodes.logs import policy, recorded, write
 from tests.helpers import limited
 from trackmdp.episodes import grids
-from trackmdp.episodes.episode import first_difference
+from trackmdp.episodes.differences import first_difference
 from trackmdp.episodes.grids import WHOLE_CELLS
 from trackmdp.episodes.layouts import layout
 from trackmdp.episodes.reader import EpisodeReader

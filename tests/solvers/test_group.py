@@ -45,10 +45,10 @@ def best_of_all(group: Group) -> float:
     ]
     chain = explored(group, lambda _: sets, 10_000)
     assert chain is not None
-    value: Array = np.zeros(chain.states)
+    value: Array = np.zeros(chain.moves.shape[1])
     for step in itertools.count(1):
         worth = chain.totals[:, 0] + chain.moves @ value
-        after = np.full(chain.states, -np.inf)
+        after = np.full(chain.moves.shape[1], -np.inf)
         np.maximum.at(after, chain.owner, worth)
         if np.abs(after - value).max() < 1e-11 or step == group.task.max_steps:
             break

@@ -32,14 +32,18 @@ class Dynamics:
     Attributes:
         certain: whether a step needs no draw of reports.
         detection: the probability of reports.
-        mask: the sensors that can be chosen.
+        masked: whether `action_mask` is observed.
     """
+
+    waits = False
+    """Whether targets may enter later."""
 
     def __init__(self, task: Task, sampler: PathSampler) -> None:
         device = self._device = sampler.device
         self._sampler, self.detection = sampler, Detection(task, device)
         self._costs, self._outcomes = Costs(task, device), Outcomes(task, device)
-        self.mask = ActionMask(task, device)
+        self._mask = ActionMask(task, device)
+        self.masked = self._mask.observed
         self.certain = self._outcomes.certain
         self._num_cells, self._max_steps = task.num_cells, task.max_steps
         self._safe, self._keys = task.safe, task.keys if task.keyed else None
@@ -56,8 +60,8 @@ class Dynamics:
             state["key"] = self._keys.start(cell, self._sampler.mode(place))
         if self._max_steps:
             state["step_count"] = none.clone()
-        if self.mask.observed:
-            state["action_mask"] = self.mask(cell)
+        if self.masked:
+            state["action_mask"] = self._mask(cell)
         return state
 
     def cell(self, state: Mapping[str, Tensor]) -> Tensor:
@@ -78,7 +82,7 @@ class Dynamics:
         last, n = state["last_cell"], state["steps_since_detection"]
         place = self._sampler.move(state["place"], draws)
         target = self._sampler.cell(place)
-        chosen = action & state["action_mask"] if self.mask.observed else action
+        chosen = action & state["action_mask"] if self.masked else action
         report = self.detection(chosen, last, target)
         spent = self._costs.sensing_cost(chosen, last)
         outcome = self._outcomes(report, spent, n, target, reports)
@@ -95,8 +99,8 @@ class Dynamics:
             cell, mode = target.clamp_max(self._num_cells - 1), self._sampler.mode(place)
             key = self._keys.next(state["key"], n, cell, mode)
             following["key"] = torch.where(outcome.located, key, state["key"])
-        if self.mask.observed:
-            following["action_mask"] = self.mask(following["last_cell"])
+        if self.masked:
+            following["action_mask"] = self._mask(following["last_cell"])
         if self._max_steps:
             following["step_count"] = state["step_count"] + 1
         return following | self._flags(following, outcome.in_grid)

@@ -16,7 +16,6 @@ from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from trackmdp.environment.dynamics import FLAGS, State
-from trackmdp.environment.group_tracking import GroupTracking
 from trackmdp.environment.render import picture
 from trackmdp.environment.tracking import Snapshot, Tracking
 from trackmdp.errors import UserError
@@ -112,11 +111,7 @@ class TrackEnv(EnvBase):
     def _make_tracking(self, seed: int) -> None:
         """The targets, before their first reset, on the environment's device."""
         world, count, device = self._world, self.num_envs, self.device
-        self._tracking: Tracking | GroupTracking
-        if isinstance(world, Group):
-            self._tracking = GroupTracking(world, count, device)
-        else:
-            self._tracking = Tracking(world, count, device)
+        self._tracking = Tracking(world, count, device)
         self._none = torch.zeros((len(FLAGS), count, 1), dtype=torch.bool, device=device)
         self._set_seed(seed)
 
@@ -140,7 +135,7 @@ class TrackEnv(EnvBase):
         return self._now.target().reshape((*self.batch_size, *self._targets))
 
     @property
-    def _now(self) -> Tracking | GroupTracking:
+    def _now(self) -> Tracking:
         if not self._tracking.state:
             raise UserError("TrackEnv: a step before the first reset, expected env.reset()")
         return self._tracking
@@ -160,8 +155,8 @@ class TrackEnv(EnvBase):
                 f"render({mode!r}, {row}): expected rgb_array or text, a row of 0 ... {self.num_envs - 1}"
             )
         now = self._now
-        if isinstance(now, GroupTracking):
-            raise UserError(f"render: {now.targets} targets, expected a world of one")
+        if self._targets:
+            raise UserError(f"render: {self._targets[0]} targets, expected a world of one")
         on = now.covered(row).cpu().numpy()
         found = not now.state["steps_since_detection"][row]
         return picture(mode, self._grid, int(now.target()[row]), on, found=found)
@@ -188,7 +183,7 @@ class TrackEnv(EnvBase):
             observed["key"] = numbers(world.num_keys)
         if self.max_steps:
             observed["step_count"] = numbers(self.max_steps + 1)
-        if self._tracking.masked:
+        if self._tracking.dynamics.masked:
             observed["action_mask"] = bits(k)
         self.observation_spec = Composite(observed, shape=b)
         self.action_spec = bits(k)

@@ -2,115 +2,128 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from trackmdp.arrays.types import BoolArray, IndexArray
 from trackmdp.environment.paths import PathSampler, path_sampler
 from trackmdp.environment.targets import RecordedTargets, Targets
 from trackmdp.recordings.together import Together
-from trackmdp.recordings.tracks import Recorded
 from trackmdp.seeding import derive
 from trackmdp.world.group import Group
 
 
 class GroupPaths:
-    """By their motions; a place is a state of `Group.kernel`.
+    """By their motions a place is a state of `Group.kernel`; along tracks it is one of `Together.places`.
 
     Args:
         group: the targets.
         device: of the tensors.
+        held_out: whether recorded tracks are the held-out ones, or those to learn from.
 
     Attributes:
         sampler: samples the moves.
+        together: which tracks are followed together; None by motions.
         gone: the place of a target that has left.
-        waits: whether targets may enter later.
+        waits: whether targets may enter later; until then places are negative.
+        offset: `[K]`, the first state of each target's motion.
     """
 
-    waits = False
-
-    def __init__(self, group: Group, device: torch.device | str = "cpu") -> None:
-        self.sampler = PathSampler(group.kernel, device=device)
-        self.gone, self.cells = self.sampler.num_states, group.task.num_cells
+    def __init__(
+        self, group: Group, device: torch.device | str = "cpu", *, held_out: bool = False
+    ) -> None:
+        recorded, self.cells = group.recorded, group.task.num_cells
+        self.together: Together | None = None
+        if recorded is None:
+            self.sampler = PathSampler(group.kernel, device=device)
+        else:
+            self.sampler = path_sampler(recorded, device, held_out=held_out)
+            tracks = recorded.held_out if held_out else recorded.tracks
+            self.together = Together(tracks, len(group))
+        self.gone, self.waits = self.sampler.num_states, recorded is not None
         self.offset = torch.as_tensor(group.kind * self.cells, device=device)
 
     def begin(self, rng: torch.Generator) -> Tensor:
         """`[K]`, places at the start of an episode."""
-        return torch.randint(self.cells, self.offset.shape, generator=rng) + self.offset
-
-    def move(self, place: Tensor, draws: Tensor) -> Tensor:
-        """`[B, K]`, next places of targets in `place` for the `draws` `[B, K]` of the sampler."""
-        return self.sampler.move(place.reshape(-1), draws.reshape(-1)).view(place.shape)
-
-    def inside(self, place: Tensor) -> Tensor:
-        """`[B, K]`, whether targets are in the grid."""
-        return place < self.gone
-
-    def cell(self, place: Tensor) -> Tensor:
-        """`[B, K]`, cells of targets; of no meaning where they are not in the grid."""
-        return place % self.cells
-
-    def state(self, place: Tensor) -> Tensor:
-        """`[B, K]`, states of `Group.kernel`, as `cell`."""
-        return place
-
-    def ended(self, place: Tensor) -> Tensor:
-        """`[B]`, whether an episode ends here: no target is in the grid, or none whose recording goes on."""
-        return ~self.inside(place).any(-1)
-
-
-class AlongTracks(GroupPaths):
-    """Along tracks of a recording, those to learn from or the held-out ones; places are those of `together`."""
-
-    waits = True
-
-    def __init__(
-        self, recorded: Recorded, count: int, device: torch.device | str = "cpu", *, held_out: bool
-    ) -> None:
-        self.sampler = path_sampler(recorded, device, held_out=held_out)
-        self.gone, self.cells = self.sampler.num_states, recorded.num_cells
-        self.together = Together(recorded.held_out if held_out else recorded.tracks, count)
-
-    def begin(self, rng: torch.Generator) -> Tensor:
-        """See `GroupPaths`; one of `Together.groups`."""
-        groups = self.together.groups
-        number = int(torch.randint(len(groups), (1,), generator=rng))
-        return torch.as_tensor(self.together.places(groups[number : number + 1])[0])
+        if self.together is None:
+            return torch.randint(self.cells, self.offset.shape, generator=rng) + self.offset
+        every = self.every()
+        return every[int(torch.randint(len(every), (1,), generator=rng))]
 
     def every(self) -> Tensor:
         """`[G, K]`, places at the start of all of `Together.groups`."""
+        assert self.together is not None
         return torch.as_tensor(self.together.places(self.together.groups))
 
     def move(self, place: Tensor, draws: Tensor) -> Tensor:
-        """See `GroupPaths`."""
-        after = super().move(place.clamp_min(0), draws)
-        return torch.where(place < 0, place + self.gone, after)
+        """`[B, K]`, next places of targets in `place` for the `draws` `[B, K]` of the sampler."""
+        after = self.sampler.move(self._flat(place), draws.reshape(-1)).view(place.shape)
+        return torch.where(place < 0, place + self.gone, after) if self.waits else after
 
     def inside(self, place: Tensor) -> Tensor:
-        """See `GroupPaths`."""
-        return (place >= 0) & (place < self.gone)
+        """`[B, K]`, whether targets are in the grid."""
+        inside = place < self.gone
+        return inside & (place >= 0) if self.waits else inside
 
     def cell(self, place: Tensor) -> Tensor:
-        """See `GroupPaths`."""
-        cell = self.sampler.cell(place.clamp_min(0).reshape(-1)).view(place.shape)
-        return cell.clamp_max(self.cells - 1)
+        """`[B, K]`, cells of targets; of no meaning where they are not in the grid."""
+        if not self.waits:
+            return place % self.cells
+        return self.sampler.cell(self._flat(place)).view(place.shape).clamp_max(self.cells - 1)
 
-    state = cell
+    def state(self, place: Tensor) -> Tensor:
+        """`[B, K]`, states of `Group.kernel`, as `cell`."""
+        return self.cell(place) if self.waits else place
 
     def ended(self, place: Tensor) -> Tensor:
-        """See `GroupPaths`."""
-        stops = self.sampler.stops(place.clamp_min(0).reshape(-1))
-        assert stops is not None
-        return ~(self.inside(place) & ~stops.view(place.shape)).any(-1)
+        """`[B]`, whether an episode ends here: no target is in the grid, or none whose recording goes on."""
+        stops, inside = self.sampler.stops(self._flat(place)), self.inside(place)
+        return ~(inside if stops is None else inside & ~stops.view(place.shape)).any(-1)
+
+    def _flat(self, place: Tensor) -> Tensor:
+        """`[B K]`, for the sampler, which knows no targets that are still to enter."""
+        return (place.clamp_min(0) if self.waits else place).reshape(-1)
 
 
-def group_paths(
-    group: Group, device: torch.device | str = "cpu", *, held_out: bool = False
-) -> GroupPaths:
-    """By the motions of a group, or along its recorded tracks: those to learn from, or on request the held-out ones."""
-    if group.recorded is None:
-        return GroupPaths(group, device)
-    return AlongTracks(group.recorded, len(group), device, held_out=held_out)
+class Walks:
+    """Targets of E episodes on their paths, in NumPy; see `solvers/several/simulation.py`.
+
+    Args:
+        paths: of the targets.
+        place: `[E, K]`, at the start.
+        draws: `[R, K]` of the moves of the running episodes `row` `[R]` at a step; None: moves are certain.
+    """
+
+    state: IndexArray
+    inside: BoolArray
+
+    def __init__(
+        self, paths: GroupPaths, place: Tensor, draws: Callable[[Tensor, int], Tensor] | None = None
+    ) -> None:
+        self._paths, self._draws = paths, draws
+        self._stand(place)
+
+    def _stand(self, place: Tensor) -> None:
+        self._place = place
+        self.state, self.inside = (
+            each(place).numpy() for each in (self._paths.state, self._paths.inside)
+        )
+
+    def move(self, row: IndexArray, step: int) -> None:
+        """Move all targets; `row` are the episodes still running."""
+        drawn = torch.zeros_like(self._place)
+        if self._draws is not None:
+            rows = torch.from_numpy(row)
+            drawn[rows] = self._draws(rows, step)
+        self._stand(self._paths.move(self._place, drawn))
+
+    def ended(self) -> BoolArray:
+        """`[E]`, whether an episode ends here."""
+        found: BoolArray = self._paths.ended(self._place).numpy()
+        return found
 
 
 class Members(Targets):
@@ -129,9 +142,9 @@ class Members(Targets):
 class TrackMembers(RecordedTargets):
     """Targets of all groups in a row, `[B K]`: each start is that of one, whom others join that overlap with it."""
 
-    def __init__(self, paths: AlongTracks) -> None:
+    def __init__(self, paths: GroupPaths, together: Together) -> None:
         super().__init__(paths.sampler)
-        self._together = paths.together
+        self._together = together
 
     def _start(self, rows: Tensor) -> Tensor:
         each, number = self._together.count, self._drawn
@@ -147,4 +160,4 @@ class TrackMembers(RecordedTargets):
 
 def group_members(paths: GroupPaths, count: int) -> Targets:
     """The targets of `count` groups that follow `paths`."""
-    return TrackMembers(paths) if isinstance(paths, AlongTracks) else Members(paths, count)
+    return Members(paths, count) if paths.together is None else TrackMembers(paths, paths.together)

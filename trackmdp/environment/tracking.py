@@ -9,26 +9,49 @@ from torch import Tensor
 
 from trackmdp.environment.draws import UniformDraws
 from trackmdp.environment.dynamics import Dynamics, State, rowwise
+from trackmdp.environment.group_dynamics import GroupDynamics
+from trackmdp.environment.group_paths import GroupPaths, group_members
 from trackmdp.environment.targets import Targets, make_targets
+from trackmdp.world.group import Group
 from trackmdp.world.problem import Problem
 
 Snapshot = Mapping[str, Mapping[str, Tensor]]
 
 
-class TargetBatch:
-    """State and generators of a batch of targets, for a checkpoint; a subclass steps them.
+class Tracking:
+    """State of B targets `[B, ...]`, or of B groups, and the generators of their draws.
+
+    Args:
+        problem: a world, recorded tracks, or a group.
+        count: B.
+        device: device of the tensors.
 
     Attributes:
         device: of the tensors.
+        dynamics: initial states and steps as pure functions.
         state: of all targets, empty before the first restart. Its tensors are replaced, never written to, as they are
             those observed.
     """
 
-    device: torch.device
-    state: State
-    _targets: Targets
-    _reports: UniformDraws
-    _every: Tensor
+    dynamics: Dynamics | GroupDynamics
+
+    def __init__(self, problem: Problem | Group, count: int, device: torch.device) -> None:
+        self.device, task, self._each = device, problem.single, len(problem.targets) or 1
+        self._t_max, self._cells = task.t_max, torch.arange(task.num_cells, device=device)
+        if isinstance(problem, Group):
+            paths = GroupPaths(problem, device)
+            self._targets: Targets = group_members(paths, count)
+            self.dynamics = GroupDynamics(task, paths, self._each)
+        else:
+            self._targets = make_targets(problem, device)
+            self.dynamics = Dynamics(problem, self._targets.sampler)
+        self._reports = UniformDraws(device, None if self.dynamics.certain else "report")
+        self._every = torch.ones(count * self._each, dtype=torch.bool, device=device)
+        self.state: State = {}
+        # Of the last step: the action, the last located cells and the misses before it; and masks `[B, 1]` of the rows
+        # begun anew since.
+        self._acted: tuple[Tensor, Tensor, Tensor] | None = None
+        self._begun: list[Tensor] = []
 
     def seed(self, seed: int, stream: str) -> None:
         """Start the generators anew; their names begin with `stream`."""
@@ -56,7 +79,7 @@ class TargetBatch:
         except BaseException:
             self._load_generators(before)
             raise
-        self.state = rows
+        self.state, self._acted = rows, None
 
     def _load_generators(self, states: Mapping[str, Tensor]) -> None:
         for draws in (self._targets, self._reports):
@@ -64,49 +87,15 @@ class TargetBatch:
 
     def _check(self, rows: State) -> None:
         """Raise a ValueError unless `rows` have the form of a state and the targets are in places that exist."""
-        expected = self._fresh(torch.zeros_like(self._every, dtype=torch.int64))
+        expected = self.dynamics.start(torch.zeros_like(self._every, dtype=torch.int64))
         forms = {key: (value.shape, value.dtype) for key, value in expected.items()}
         if {key: (value.shape, value.dtype) for key, value in rows.items()} != forms:
             raise ValueError("other tensors")
         place = rows["place"]
-        if not ((place >= 0) & (place <= self._targets.sampler.num_states)).all():
+        # The places of targets that are still to enter are negative.
+        exists = (place >= 0) | self.dynamics.waits
+        if not (exists & (place <= self._targets.sampler.num_states)).all():
             raise ValueError("no place of a target")
-
-    def _fresh(self, place: Tensor) -> State:
-        """Initial states of targets in `place` `[B]`, which are located."""
-        raise NotImplementedError
-
-
-class Tracking(TargetBatch):
-    """State of B targets `[B, ...]`, and the generators of their draws.
-
-    Args:
-        problem: a world or recorded tracks.
-        count: B.
-        device: device of the tensors.
-
-    Attributes:
-        dynamics: initial states and steps as pure functions.
-        state: see `TargetBatch`.
-    """
-
-    def __init__(self, problem: Problem, count: int, device: torch.device) -> None:
-        self.count, self.device, self._t_max = count, device, problem.t_max
-        self._cells = torch.arange(problem.num_cells, device=device)
-        self._targets = make_targets(problem, device)
-        self.dynamics = Dynamics(problem, self._targets.sampler)
-        self._reports = UniformDraws(device, None if self.dynamics.certain else "report")
-        self._every = torch.ones(count, dtype=torch.bool, device=device)
-        self.state = {}
-        # Of the last step: the action, the last located cells and the misses before it; and masks `[B, 1]` of the rows
-        # begun anew since.
-        self._acted: tuple[Tensor, Tensor, Tensor] | None = None
-        self._begun: list[Tensor] = []
-
-    @property
-    def masked(self) -> bool:
-        """Whether `action_mask` is observed."""
-        return self.dynamics.mask.observed
 
     def restart(self) -> None:
         """New episodes in all rows."""
@@ -115,17 +104,17 @@ class Tracking(TargetBatch):
     def begin(self, done: Tensor) -> None:
         """New episodes in the rows of a mask `[B, 1]`."""
         self._begun.append(done)
-        state = self.state
+        state, rows = self.state, done.squeeze(-1)
+        begun = rows if self._each == 1 else done.expand(-1, self._each).reshape(-1)
         if torch.compiler.is_compiling() or self.device.type != "cpu":
             # No shape and no branch may depend on the number of rows.
-            rows = done.squeeze(-1)
-            fresh = self.dynamics.start(self._targets.start(rows))
+            fresh = self.dynamics.start(self._targets.start(begun))
             self.state = {key: rowwise(rows, fresh[key], value) for key, value in state.items()}
         elif (at := done.nonzero()).numel():
-            at = at[:, 0]
-            fresh = self.dynamics.start(self._targets.start(done.squeeze(-1)).index_select(0, at))
-            # Empty already where the episode did not end in a miss; the history is the largest part by far.
-            missed = state["steps_since_detection"].index_select(0, at).any()
+            at, starts = at[:, 0], self._targets.start(begun).view(len(done), -1)
+            fresh = self.dynamics.start(starts.index_select(0, at).view(-1))
+            # Empty already of one target whose episode did not end in a miss; the history is the largest part by far.
+            missed = "present" in state or state["steps_since_detection"].index_select(0, at).any()
             same = () if missed else ("steps_since_detection", "action_history")
             self.state = {
                 key: value if key in same else value.index_copy(0, at, fresh[key])
@@ -133,7 +122,7 @@ class Tracking(TargetBatch):
             }
 
     def step(self, action: Tensor) -> State:
-        """One step with the sensors of `action` `[B, K]` bool on; returns the state, the reward and the flags."""
+        """One step with the sensors of `action` `[B, S]` bool on; returns the state, the reward and the flags."""
         state = self.state
         draws, reports = self._targets.draw(self._every), self._reports(self._every)
         following = self.dynamics.advance(state, action, draws, reports)
@@ -143,24 +132,16 @@ class Tracking(TargetBatch):
         return following
 
     def target(self) -> Tensor:
-        """`[B]` cells of the targets, M after an exit."""
+        """`[B]` or `[B, K]` cells of the targets, M where they are not in the grid."""
         return self.dynamics.cell(self.state)
 
     def covered(self, row: int) -> Tensor:
         """`[M]` bool, the cells that the sensors of a row's last step cover; none where an episode has just begun."""
         if self._acted is None or any(done[row] for done in self._begun):
             return self._cells < 0
+        assert isinstance(self.dynamics, Dynamics)
         action, last, misses = (each[row] for each in self._acted)
         if misses > self._t_max:
             return self._cells >= 0
         action, last = action.expand(len(self._cells), -1), last.expand(len(self._cells))
         return self.dynamics.detection(action, last, self._cells) > 0
-
-    def load(self, snapshot: Snapshot) -> None:
-        """See `TargetBatch`."""
-        super().load(snapshot)
-        self._acted = None
-
-    def _fresh(self, place: Tensor) -> State:
-        """See `TargetBatch`."""
-        return self.dynamics.start(place)

@@ -1,62 +1,41 @@
-"""Simulated episodes as a few columns with the steps of all, from which an `Episode` is made on request; their figures.
-
-Figures are means over episodes, each with its standard error.
-"""
+"""Simulated episodes as a few columns with the steps of all, from which an `Episode` is made on request."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self, cast, overload
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from tensordict import TensorDict
 
 from trackmdp.arrays.types import AnyArray, Array, BoolArray, Indices
+from trackmdp.durable import write_text
 from trackmdp.episodes.belief_filter import beliefs
 from trackmdp.episodes.episode import Episode, Floats, last_cells
 from trackmdp.episodes.episode_draws import Columns
 from trackmdp.episodes.grids import check_layers
-from trackmdp.episodes.showing import Showing
-from trackmdp.notebook.card import Card, decimal, grid_words, percent
+from trackmdp.episodes.simulated_figures import Simulation, simulation
+from trackmdp.errors import UserError, output_of
+from trackmdp.notebook.card import Card, Carded, decimal, grid_words, percent
 from trackmdp.policies.policy import Policy
+from trackmdp.solvers.several.merging import Rule
+from trackmdp.world.group import Group
 from trackmdp.world.problem import Problem
 
 _BELIEF = 25_600  # cells, or hidden states, of the beliefs updated together: memory stays bounded on large grids
 
 
-@dataclass(frozen=True)
-class MeanEstimate:
-    """A mean over simulated episodes with its standard error (nan for a single episode)."""
-
-    mean: float
-    standard_error: float
-
-
-@dataclass(frozen=True)
-class Simulation:
-    """Figures of simulated episodes; `accuracy` is pooled, as the exact one, `episode_accuracy` the mean over episodes.
-
-    Figures per step are ratios of sums over all episodes; their standard errors are those of a ratio estimate.
-    """
-
-    episodes: int
-    aihtr: MeanEstimate
-    accuracy: MeanEstimate
-    episode_accuracy: MeanEstimate
-    sensors_per_step: MeanEstimate
-    safe_per_episode: MeanEstimate
-    expected_length: MeanEstimate
-
-
 @dataclass(frozen=True, eq=False, repr=False)
-class Episodes(Showing[Episode]):
+class Episodes(Carded, Sequence[Episode]):
     """The episodes of one policy, all their steps end to end; a sequence of `Episode`.
 
     Attributes:
         problem: where they took place.
-        policy: that acted; None for one that is no table (a playback, a function that draws).
+        policy: that acted, a `Policy` or a `Rule`; None for one that is no table (a playback, a function that draws).
         seeds: of each of the E episodes.
         start: `[E]`, cells in which the targets were located at the start.
         first: `[E + 1]`, where each episode's steps begin in the columns below, and S.
@@ -72,8 +51,8 @@ class Episodes(Showing[Episode]):
         start_mode: `[E]`, their modes at the start; 0 where they have none.
     """
 
-    problem: Problem
-    policy: Policy | None
+    problem: Any
+    policy: Any
     seeds: Sequence[int]
     start: Indices
     first: Indices
@@ -91,11 +70,11 @@ class Episodes(Showing[Episode]):
     @classmethod
     def of(
         cls,
-        problem: Problem,
-        policy: Policy | None,
+        problem: Problem | Group,
+        policy: Policy | Rule | None,
         seeds: Sequence[int],
         batches: Sequence[Columns],
-    ) -> Episodes:
+    ) -> Self:
         """The episodes of some batches, in their order; each has the columns, and the `length` of its episodes.
 
         At least one batch, which without `seeds` gives no more than the types of the columns.
@@ -109,6 +88,18 @@ class Episodes(Showing[Episode]):
         return cls(
             problem, policy, list(seeds), first=first, bits=columns.pop("bits", None), **columns
         )
+
+    def __len__(self) -> int:
+        return len(self.seeds)
+
+    @overload
+    def __getitem__(self, which: int) -> Episode: ...
+    @overload
+    def __getitem__(self, which: slice) -> list[Episode]: ...
+    def __getitem__(self, which: int | slice) -> Episode | list[Episode]:
+        if isinstance(which, slice):
+            return [self._episode(number) for number in range(len(self))[which]]
+        return self._episode(range(len(self))[which])
 
     @property
     def nbytes(self) -> int:
@@ -137,22 +128,20 @@ class Episodes(Showing[Episode]):
     def _episode(self, number: int) -> Episode:
         steps = slice(int(self.first[number]), int(self.first[number + 1]))
         target, located = self.target[steps].astype(np.int64), self.located[steps]
-        misses, start = self.misses[steps].astype(np.int64), int(self.start[number])
+        misses, start = self.misses[steps].astype(np.int64), self.start[number]
+        truncated = bool(self.truncated[steps][-1])
         return Episode(
             number=number,
             seed=self.seeds[number],
             policy=0,
-            start=start,
+            start=start if start.ndim else int(start),
             misses=misses,
-            action=self._action(
-                steps, self._keys(steps, last_cells(start, target, located)[:-1]), misses
-            ),
+            action=self._action(steps, start, misses, target, located),
             target=target,
             located=located,
             reward=self.reward[steps],
-            # Cell M stands for the exit, which no later step follows.
-            terminated=bool(target[-1] == self.problem.num_cells),
-            truncated=bool(self.truncated[steps][-1]),
+            terminated=not truncated,
+            truncated=truncated,
             mode=None if self.mode is None else self.mode[steps].astype(np.int64),
             start_mode=0 if self.start_mode is None else int(self.start_mode[number]),
         )
@@ -161,21 +150,23 @@ class Episodes(Showing[Episode]):
         """`[T]`, the policy's key before each step."""
         return last_cell if self.key is None else self.key[steps].astype(np.int64)
 
-    def _action(self, steps: slice, key: Indices, misses: Indices) -> BoolArray:
+    def _action(
+        self, steps: slice, start: Any, misses: Indices, target: Indices, located: BoolArray
+    ) -> BoolArray:
         """`[T, S]`."""
         # A policy with a table needs no bits: its action follows from (key, misses), and S rows of M bits are not
         # kept.
         if self.bits is not None:
-            return np.unpackbits(
-                self.bits[steps], axis=-1, count=self.problem.total_sensors
-            ).astype(np.bool_)
-        assert self.policy is not None
-        return self.policy.act(torch.from_numpy(key), torch.from_numpy(misses)).numpy()
+            count = self.problem.task.total_sensors
+            return np.unpackbits(self.bits[steps], axis=-1, count=count).astype(np.bool_)
+        key = self._keys(steps, last_cells(start, target, located)[:-1])
+        found: BoolArray = self.policy.act(torch.from_numpy(key), torch.from_numpy(misses)).numpy()
+        return found
 
     def figures(self) -> Simulation:
         """The policy's figures from the episodes, with standard errors."""
         if not len(self):
-            return _summary(np.zeros((6, 0)))
+            return simulation(np.zeros((6, 0)))
         in_grid = self.target < self.problem.num_cells
         forced = (self.misses > self.problem.t_max) & in_grid
         # Sensors are counted where they cost: not at the exit, nor where the safe action replaced them.
@@ -193,15 +184,17 @@ class Episodes(Showing[Episode]):
         totals: Array = np.stack(
             [np.add.reduceat(column.astype(np.float64), self.first[:-1]) for column in columns]
         )
-        return _summary(totals)
+        return simulation(totals)
 
     @property
     def _at_once(self) -> int:
+        """Episodes that are completed together: memory stays bounded on large grids."""
         world = self.problem.model
         states = self.problem.num_cells if world is None else world.num_states
         return max(1, min(256, _BELIEF // states))
 
     def _completed(self, begin: int, end: int) -> Iterator[Episode]:
+        """See `complete`; those from number `begin` to `end` - 1."""
         some = self[begin:end]
         check_layers(sum(map(len, some)), self.problem.num_cells)
         if (world := self.problem.model) is None:
@@ -217,43 +210,56 @@ class Episodes(Showing[Episode]):
         steps = slice(int(self.first[episode.number]), int(self.first[episode.number + 1]))
         key = self._keys(steps, episode.last_cell)
         state = torch.from_numpy(key), torch.from_numpy(episode.misses)
-        return self.policy.seeing(*state).float().numpy()
+        found: Floats = self.policy.seeing(*state).float().numpy()
+        return found
 
+    def complete(self) -> Iterator[Episode]:
+        """The episodes with `belief`, and of one target with `probability`, computed for some of them at a time.
 
-def _summary(totals: Array) -> Simulation:
-    """The figures of E episodes from `[6, E]` sums over their steps.
+        Recorded tracks have no motion model; the belief of one target is 0 in all cells.
+        """
+        for begin in range(0, len(self), self._at_once):
+            yield from self._completed(begin, min(begin + self._at_once, len(self)))
 
-    The rows of `totals` are reward, steps in the grid, detections, sensors on by choice, safe actions, and steps.
-    """
-    reward, steps, detections, sensors, forced, length = totals
-    # An episode that starts with the exit has no step in the grid, and no accuracy.
-    some = steps > 0
-    return Simulation(
-        episodes=len(reward),
-        aihtr=_mean(reward),
-        accuracy=_ratio(detections, steps),
-        episode_accuracy=_mean(detections[some] / steps[some]),
-        sensors_per_step=_ratio(sensors, steps),
-        safe_per_episode=_mean(forced),
-        expected_length=_mean(length),
-    )
+    def to_tensordict(self) -> TensorDict:
+        """`[S]` the steps of all episodes, as of `Episode.to_tensordict`, and the number of each, `episode`."""
+        parts = [
+            each.to_tensordict(self.problem.task).set("episode", torch.full((len(each),), number))
+            for number, each in enumerate(self)
+        ]
+        return cast(TensorDict, torch.cat(parts)) if parts else TensorDict({}, [0])
 
+    def _shown(self, call: str, number: int) -> Episode:
+        """A complete episode.
 
-def _mean(values: Array) -> MeanEstimate:
-    if len(values) == 0:
-        return MeanEstimate(math.nan, math.nan)
-    error = float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
-    return MeanEstimate(float(values.mean()), error)
+        Raises:
+            UserError: there is no such episode; the line begins with `call`.
+        """
+        if not 0 <= number < len(self):
+            raise UserError(f"{call}: episode {number}, expected 0 to {len(self) - 1}")
+        return next(iter(self._completed(number, number + 1)))
 
+    def page(self, file: str | Path, number: int = 0) -> Path:
+        """Write an episode as a web page that needs no network, and return its path.
 
-def _ratio(part: Array, whole: Array) -> MeanEstimate:
-    """Σ part / Σ whole; its standard error by the delta method.
+        Raises:
+            UserError: there is no such episode, or the file cannot be written there.
+        """
+        from trackmdp.episodes.episode_page import page
 
-    The ratio R = mean(p) / mean(w) errs to first order by mean(p - R w) / mean(w), a mean over episodes.
-    """
-    if not whole.any():
-        return MeanEstimate(math.nan, math.nan)
-    ratio = float(part.sum() / whole.sum())
-    residual = part - ratio * whole
-    scale = float(whole.mean()) * math.sqrt(len(part))
-    return MeanEstimate(ratio, float(residual.std(ddof=1)) / scale if len(part) > 1 else math.nan)
+        place = output_of(file, "page")
+        write_text(place, page(self.problem, self._shown("page", number)))
+        return place
+
+    def video(self, file: str | Path, number: int = 0, *, speed: int = 4) -> Path:
+        """Write an episode as a `.gif` or `.mp4` of `speed` steps per second, and return its path (extra `video`).
+
+        Raises:
+            UserError: there is no such episode, the file cannot be written there, another ending, or a package is
+                missing.
+        """
+        from trackmdp.episodes.video import write_video
+
+        place = output_of(file, "video")
+        write_video(place, self.problem.single, self._shown("video", number), speed)
+        return place

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -14,7 +14,7 @@ from tensordict import TensorDict
 
 from trackmdp.arrays.types import AnyArray, Array, BoolArray, Indices
 from trackmdp.memory.keys import KeySpace
-from trackmdp.notebook.card import Card, Carded, Facts, decimal
+from trackmdp.notebook.card import Card, Carded, decimal
 from trackmdp.sensing.actions import ActionMask
 from trackmdp.sensing.task import Task
 from trackmdp.sensing.windows import Window
@@ -23,8 +23,10 @@ Floats: TypeAlias = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Recording(Carded):
-    """T steps of one target or of K. Row t is step t: state and action before the move, outcome after it.
+class Episode(Carded):
+    """T steps of one target, or of K that share the sensors, column k of target k.
+
+    Row t is step t: state and action before the move, outcome after it.
 
     Attributes:
         number: its place in the log.
@@ -38,10 +40,13 @@ class Recording(Carded):
         reward: `[T]` reward of the step, of all targets together.
         terminated: the target, or the last one, exited in the last step.
         truncated: the last step was the last one allowed.
-        belief: probability of each cell after the move, given all that was observed before it; None unless it was
+        belief: `[T, M]` probability of each cell after the move, given all that was observed before it; a row sums to
+            the probability of no exit. Of K targets `[T · K, M]` sparse, row t · K + k of target k. None unless it was
             asked for.
         mode: `[T]` the target's mode after the move, -1 once exited; None where targets have none.
         first_tick: place of its first step on the log's time line; None until it is logged.
+        probability: `[T, M]` with which the policy sensed each cell. None unless it was asked for, and of K targets.
+        start_mode: the target's mode at the start; 0 where targets have none.
     """
 
     number: int
@@ -58,9 +63,16 @@ class Recording(Carded):
     belief: Any = None
     mode: Indices | None = None
     first_tick: int | None = None
+    probability: Any = None
+    start_mode: int = 0
 
     def __len__(self) -> int:
         return len(self.target)
+
+    @property
+    def several(self) -> bool:
+        """Whether it is of K targets."""
+        return self.target.ndim > 1
 
     @cached_property
     def observation(self) -> Indices:
@@ -70,12 +82,7 @@ class Recording(Carded):
     @property
     def last_cell(self) -> Indices:
         """`[T]` cell of the last detection before the step, x_{l(k)}; of K targets `[T, K]`."""
-        return self._last_cells[:-1]
-
-    @cached_property
-    def _last_cells(self) -> Indices:
-        """`[T + 1]`, also after the last step."""
-        return last_cells(self.start, self.target, self.located)
+        return last_cells(self.start, self.target, self.located)[:-1]
 
     @cached_property
     def returns(self) -> Array:
@@ -85,103 +92,94 @@ class Recording(Carded):
     def forced(self, t_max: int) -> BoolArray:
         """`[T]` whether the safe action replaced the chosen one."""
         late = self.misses > t_max
-        found: BoolArray = late if late.ndim == 1 else np.any(late, axis=1)
+        found: BoolArray = np.any(late, axis=1) if self.several else late
         found[-1] &= not self.terminated  # the last step is the exit's
         return found
 
     def singles(self) -> Iterator[Episode]:
         """An episode for each target, with the sensors and the reward of all."""
-        raise NotImplementedError
+        if not self.several:
+            yield self
+            return
+        for k, start in enumerate(self.start):
+            columns = {name: getattr(self, name)[:, k] for name in ("misses", "target", "located")}
+            belief = None if self.belief is None else self.belief[k :: len(self.start)].toarray()
+            probability = self.action.astype(np.float32)
+            yield replace(self, start=int(start), belief=belief, probability=probability, **columns)
 
     def expected(self, t: int) -> AnyArray:
         """`[M]` how many targets were expected in each cell at step `t`; beliefs were asked for."""
-        raise NotImplementedError
+        if not self.several:
+            return self.belief[t]
+        rows = self.belief[t * len(self.start) : (t + 1) * len(self.start)]
+        return np.asarray(rows.sum(axis=0), dtype=np.float64)
 
     def to_tensordict(self, task: Task) -> TensorDict:
         """`[T]` steps under the keys of `TrackEnv`, as a rollout has them: the outcome of each step under `next`.
 
-        As in a rollout the true cell is not among them; it is `target`. With `max_steps` there is a `step_count`.
+        As in a rollout the true cell is not among them; it is `target`. With a window actions are in its local numbers,
+        as the environment takes them. With `max_steps` there is a `step_count`.
         """
-        raise NotImplementedError
-
-    def _card(self, facts: Facts, located: str) -> Card:
-        """A card that begins with `facts`."""
-        facts |= {"return": decimal(float(self.returns[-1])), "located": located}
-        facts["sensors per step"] = decimal(float(self.action.sum(1).mean()))
-        return Card(f"Episode: number {self.number}, seed {self.seed}", facts)
-
-    def _transitions(
-        self, task: Task, states: dict[str, AnyArray], action: BoolArray
-    ) -> TensorDict:
-        """See `to_tensordict`; of the T + 1 `states` the last has no action, and the first is no outcome."""
-        if task.max_steps:
-            states["step_count"] = np.arange(len(self) + 1)
-        current = {key: value[:-1] for key, value in states.items()}
-        following = {key: value[1:] for key, value in states.items()}
-        following["reward"] = self.reward[:, None]
-        for part, terminated, truncated in (
-            (current, False, False),
-            (following, self.terminated, self.truncated),
-        ):
-            part |= ends(len(self), terminated, truncated)
-        return TensorDict({**current, "action": action, "next": following}, [len(self)])
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Episode(Recording):
-    """Steps of one target; see `Recording`.
-
-    Attributes:
-        belief: `[T, M]`; a row sums to the probability of no exit.
-        probability: `[T, M]` with which the policy sensed each cell. None unless it was asked for.
-        start_mode: the target's mode at the start; 0 where targets have none.
-    """
-
-    start: int
-    probability: Any = None
-    start_mode: int = 0
+        return _transitions(self, task)
 
     def card(self) -> Card:
         """Length, return, detections and end."""
-        end = "the target exited" if self.terminated else "truncated"
-        facts = {"steps": f"{len(self):,}; {end}", "start": f"cell {self.start}"}
-        return self._card(facts, f"in {int(self.located.sum()):,} steps")
+        who = "all targets" if self.several else "the target"
+        end, count = f"{who} exited" if self.terminated else "truncated", int(self.located.sum())
+        facts = {"targets": str(len(self.start))} if self.several else {}
+        facts["steps"] = f"{len(self):,}; {end}"
+        if not self.several:
+            facts["start"] = f"cell {self.start}"
+        facts["return"] = decimal(float(self.returns[-1]))
+        facts["located"] = f"{count:,} times" if self.several else f"in {count:,} steps"
+        facts["sensors per step"] = decimal(float(self.action.sum(1).mean()))
+        return Card(f"Episode: number {self.number}, seed {self.seed}", facts)
 
-    def singles(self) -> Iterator[Episode]:
-        """See `Recording`."""
-        yield self
 
-    def expected(self, t: int) -> AnyArray:
-        """See `Recording`."""
-        return self.belief[t]
+def _transitions(episode: Episode, task: Task) -> TensorDict:
+    """See `Episode.to_tensordict`."""
+    steps = len(episode)
+    states, action = (_of_several if episode.several else _of_one)(episode, task)
+    if task.max_steps:
+        states["step_count"] = np.arange(steps + 1)
+    # Of the T + 1 states the last has no action, and the first is no outcome.
+    current = {key: value[:-1] for key, value in states.items()}
+    following = {key: value[1:] for key, value in states.items()}
+    following["reward"] = episode.reward[:, None]
+    current |= _ends(steps, False, False)
+    following |= _ends(steps, episode.terminated, episode.truncated)
+    return TensorDict({**current, "action": action, "next": following}, [steps])
 
-    def to_tensordict(self, task: Task) -> TensorDict:
-        """See `Recording`; with a window actions are in its local numbers, as the environment takes them."""
-        action = (
-            Window.of(task)
-            .to_local(torch.from_numpy(self.last_cell), torch.from_numpy(self.action))
-            .numpy()
-        )
-        over = self.located[-1] or self.terminated
-        misses = np.append(self.misses, 0 if over else min(self.misses[-1] + 1, task.t_max + 1))
-        states = {
-            "last_cell": self._last_cells,
-            "steps_since_detection": misses,
-            "action_history": _history(action, misses, self.located, task.t_max),
-        }
-        if task.keyed:
-            states["key"] = self._keys(task.keys)
-        if (mask := ActionMask(task)).observed:
-            states["action_mask"] = mask(torch.from_numpy(self._last_cells)).numpy()
-        return self._transitions(task, states, action)
 
-    def _keys(self, keys: KeySpace) -> Indices:
-        """`[T + 1]` the memory in each state."""
-        found = [np.int64(keys.start(self.start, self.start_mode))]
-        mode = 0 * self.target if self.mode is None else self.mode
-        for each in zip(self.located, self.misses, self.target, mode, strict=True):
-            found.append(keys.next(found[-1], *each[1:]) if each[0] else found[-1])
-        return np.array(found)
+def _of_one(episode: Episode, task: Task) -> tuple[dict[str, AnyArray], BoolArray]:
+    """States `[T + 1, ...]` and actions of one target."""
+    cells = last_cells(episode.start, episode.target, episode.located)
+    action = (
+        Window.of(task)
+        .to_local(torch.from_numpy(cells[:-1]), torch.from_numpy(episode.action))
+        .numpy()
+    )
+    over = episode.located[-1] or episode.terminated
+    misses = np.append(episode.misses, 0 if over else min(episode.misses[-1] + 1, task.t_max + 1))
+    states = {
+        "last_cell": cells,
+        "steps_since_detection": misses,
+        "action_history": _history(action, misses, episode.located, task.t_max),
+    }
+    if task.keyed:
+        states["key"] = _keys(episode, task.keys)
+    if (mask := ActionMask(task)).observed:
+        states["action_mask"] = mask(torch.from_numpy(cells)).numpy()
+    return states, action
+
+
+def _keys(episode: Episode, keys: KeySpace) -> Indices:
+    """`[T + 1]` the memory in each state."""
+    found = [np.int64(keys.start(episode.start, episode.start_mode))]
+    mode = 0 * episode.target if episode.mode is None else episode.mode
+    for each in zip(episode.located, episode.misses, episode.target, mode, strict=True):
+        found.append(keys.next(found[-1], *each[1:]) if each[0] else found[-1])
+    return np.array(found)
 
 
 def _history(action: BoolArray, misses: Indices, located: BoolArray, t_max: int) -> BoolArray:
@@ -200,6 +198,33 @@ def _history(action: BoolArray, misses: Indices, located: BoolArray, t_max: int)
     return action[np.where(filled, steps, 0)] & filled[..., None]
 
 
+def _of_several(episode: Episode, task: Task) -> tuple[dict[str, AnyArray], BoolArray]:
+    """States `[T + 1, ...]` and actions of several targets."""
+    gone = np.append(episode.start[None], episode.target, axis=0) >= task.num_cells
+    cells = last_cells(episode.start, episode.target, episode.located)
+    more = np.minimum(episode.misses[-1] + 1, task.t_max + 1)
+    last = np.where(episode.located[-1] | gone[-1], 0, more)
+    states: dict[str, AnyArray] = {
+        "last_cell": np.where(cells < task.num_cells, cells, 0),
+        "steps_since_detection": np.append(episode.misses, last[None], axis=0),
+        "present": ~gone,
+        "action_history": _last_actions(episode, task.t_max),
+    }
+    if not task.available.all():
+        states["action_mask"] = np.broadcast_to(task.available, (len(gone), len(task.cost)))
+    return states, episode.action
+
+
+def _last_actions(episode: Episode, t_max: int) -> BoolArray:
+    """`[T + 1, t_max + 1, S]` last actions in each state, the latest first; none from before a safe action."""
+    late = np.any(episode.misses > t_max, axis=1)
+    # The state after the last safe action before it: with one at step 1 of four, 0 0 2 2 2.
+    since = np.maximum.accumulate(np.append(0, np.where(late, np.arange(len(late)) + 1, 0)))
+    step = np.arange(len(late) + 1)[:, None] - 1 - np.arange(t_max + 1)
+    kept = step >= since[:, None]
+    return episode.action[np.where(kept, step, 0)] & kept[..., None]
+
+
 def last_cells(start: Any, target: Indices, located: BoolArray) -> Indices:
     """`[T + 1]` cell of the last detection before each step of an episode, and after the last one; or `[T + 1, K]`.
 
@@ -211,7 +236,7 @@ def last_cells(start: Any, target: Indices, located: BoolArray) -> Indices:
     return np.where(latest < 0, start, np.take_along_axis(target, latest, axis=0))
 
 
-def ends(steps: int, terminated: bool, truncated: bool) -> dict[str, Any]:
+def _ends(steps: int, terminated: bool, truncated: bool) -> dict[str, Any]:
     """The flags `done`, `terminated` and `truncated` `[T, 1]` of an episode of T steps."""
     flags = {name: np.zeros((steps, 1), dtype=bool) for name in ("done", "terminated", "truncated")}
     for name, value in (
@@ -221,56 +246,3 @@ def ends(steps: int, terminated: bool, truncated: bool) -> dict[str, Any]:
     ):
         flags[name][-1] = value
     return flags
-
-
-SCALARS = ("seed", "policy", "start", "start_mode", "terminated", "truncated")
-PER_STEP = ("target", "mode", "misses", "action", "located", "reward", "probability", "belief")
-
-
-def first_difference(
-    logged: Recording, again: Recording, *, belief_tolerance: float = 0.0
-) -> str | None:
-    """Where two recordings of an episode part, in words; None where every bit is the same.
-
-    Args:
-        logged: one of them.
-        again: the other.
-        belief_tolerance: differences of the belief up to this one pass.
-    """
-    pairs = enumerate(zip(logged.singles(), again.singles(), strict=True))
-    found = {k: _first(mine, other, belief_tolerance) for k, (mine, other) in pairs}
-    several = len(found) > 1
-    said = (f"target {k}, {each}" if several else each for k, each in found.items() if each)
-    return next(said, None)
-
-
-def _first(logged: Episode, again: Episode, belief_tolerance: float) -> str | None:
-    """See `first_difference`; of one target."""
-    for name in SCALARS:
-        mine, other = getattr(logged, name), getattr(again, name)
-        if mine != other:
-            return f"{name}: logged {mine}, re-simulated {other}"
-    steps = min(len(logged), len(again))
-    known = [name for name in PER_STEP if name != "mode" or logged.mode is not None]
-    found = [_differing(logged, again, name, steps, belief_tolerance) for name in known]
-    if apart := list(filter(None, found)):
-        step, how = min(apart, key=lambda each: each[0])
-        return f"step {step}, {how}"
-    if len(logged) != len(again):
-        return f"length: logged {len(logged)} steps, re-simulated {len(again)}"
-    return None
-
-
-def _differing(
-    logged: Episode, again: Episode, name: str, steps: int, tolerance: float
-) -> tuple[int, str] | None:
-    """The first step at which the arrays called `name` differ, and how."""
-    mine, other = getattr(logged, name)[:steps], getattr(again, name)[:steps]
-    differs = mine != other
-    if name == "belief" and tolerance:
-        differs = ~(np.abs(mine - other) <= tolerance)  # so that a NaN differs from every number
-    if not differs.any():
-        return None
-    where = tuple(int(each) for each in np.argwhere(differs)[0])
-    cell = f" of cell {where[1]}" if len(where) > 1 else ""
-    return where[0], f"{name}{cell}: logged {mine[where]}, re-simulated {other[where]}"

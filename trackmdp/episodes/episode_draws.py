@@ -72,3 +72,8 @@ def joined(taken: Sequence[Columns]) -> tuple[Columns, IndexArray]:
     row = columns.pop("row")
     order = np.argsort(row, kind="stable")
     return {name: column[order] for name, column in columns.items()}, np.bincount(row)
+
+
+def narrow(column: AnyArray) -> AnyArray:
+    """A copy, since an expanded tensor has no memory of its own; cells and counts fit into 32 bits."""
+    return column.astype(np.int32) if column.dtype == np.int64 else column.copy()

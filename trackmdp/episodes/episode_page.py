@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from trackmdp.episodes.episode import Episode, Recording
+from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.target_colours import COLOURS
 from trackmdp.sensing.task import Task
 from trackmdp.solvers import bounds
@@ -26,7 +26,7 @@ _MOST_CELLS = 100
 """Shaded cells of a step, the likeliest."""
 
 
-def page(problem: Problem | Group, episode: Recording, label: str = "", seed: str = "") -> str:
+def page(problem: Problem | Group, episode: Episode, label: str = "", seed: str = "") -> str:
     """The page as text.
 
     Args:
@@ -44,7 +44,7 @@ def page(problem: Problem | Group, episode: Recording, label: str = "", seed: st
     return template.replace("@TITLE@", title).replace("@DATA@", text.replace("<", "\\u003c"))
 
 
-def _about(problem: Problem | Group, episode: Recording, seed: str) -> str:
+def _about(problem: Problem | Group, episode: Episode, seed: str) -> str:
     """The line under the title."""
     rows, columns = problem.task.size
     about = [f"{rows} x {columns} grid, {len(episode)} steps"]
@@ -60,7 +60,7 @@ def _about(problem: Problem | Group, episode: Recording, seed: str) -> str:
     return "; ".join(about)
 
 
-def _content(problem: Problem | Group, episode: Recording) -> dict[str, Any]:
+def _content(problem: Problem | Group, episode: Episode) -> dict[str, Any]:
     """The data of the page: of one target all at once, of several a part for each under `targets`."""
     shown, task = slice(0, MOST_STEPS), problem.task
     targets = [_of_target(single, task) for single in episode.singles()]
@@ -82,7 +82,7 @@ def _content(problem: Problem | Group, episode: Recording) -> dict[str, Any]:
     )
 
 
-def _of_world(problem: Problem | Group, episode: Recording) -> dict[str, Any]:
+def _of_world(problem: Problem | Group, episode: Episode) -> dict[str, Any]:
     """The clocked bound of the start cell, None without a motion model or of several targets; modes where there are."""
     world = None if isinstance(problem, Group) else problem.model
     if world is None:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from trackmdp.arrays.types import Array
-from trackmdp.episodes.group_episode import GroupEpisode
-from trackmdp.episodes.group_simulate import AT_ONCE, group_episodes
-from trackmdp.episodes.showing import Showing
+from trackmdp.episodes.batch import Episodes
+from trackmdp.episodes.episode import Episode
+from trackmdp.episodes.group_simulate import AT_ONCE, group_beliefs
 from trackmdp.notebook.card import Card, grid_words
 from trackmdp.solvers.several.group_figures import GroupEvaluation, with_ends
 from trackmdp.solvers.several.group_value import known_mean, known_rewards
@@ -22,38 +22,16 @@ _BELIEFS = 2**22
 """Numbers of the beliefs that are kept together, at most, if a target may be in 30 cells in each of 100 steps."""
 
 
-class GroupEpisodes(Showing[GroupEpisode]):
-    """The episodes of one policy for several targets; a sequence of `GroupEpisode`.
+@dataclass(frozen=True, eq=False, repr=False)
+class GroupEpisodes(Episodes):
+    """The episodes of one policy for several targets: cells, misses and detections are `[S, K]`, starts `[E, K]`."""
 
-    Args:
-        policy: for several targets.
-        seeds: of each of the E episodes.
-    """
-
-    def __init__(self, policy: Rule, seeds: Sequence[int]) -> None:
-        self.policy, self.seeds = policy, list(seeds)
-
-    @property
-    def problem(self) -> Group:
-        """Where they took place."""
-        return self.policy.group
-
-    @cached_property
-    def _made(self) -> list[GroupEpisode]:
-        return [*_numbered(group_episodes(self.policy, self.seeds), 0)]
-
-    def _episode(self, number: int) -> GroupEpisode:
-        return self._made[number]
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all arrays of all episodes."""
-        columns = (column for each in self._made for column in vars(each).values())
-        return sum(getattr(column, "nbytes", 0) for column in columns)
+    problem: Group
+    policy: Rule
 
     def card(self) -> Card:
         """Number of episodes and targets, and their figures with intervals."""
-        task, steps = self.problem.task, sum(map(len, self._made))
+        task, steps = self.problem.task, len(self.target)
         facts = {"targets": f"{len(self.problem)}", "steps": f"{steps:,}"}
         facts["problem"] = f"Group, {grid_words(task.size)}, T_max {task.t_max}"
         if len(self) > 1:
@@ -62,10 +40,10 @@ class GroupEpisodes(Showing[GroupEpisode]):
                 facts[name.replace("_", " ")] = with_ends(getattr(found, name))
         return Card(f"Episodes: {len(self):,} (figures: 95 % intervals)", facts)
 
-    def figures(self) -> GroupEvaluation:
+    def figures(self) -> GroupEvaluation:  # type: ignore[override]
         """The policy's figures from the episodes, with 95 % intervals."""
         group = self.problem
-        totals = np.array([self._totals(each) for each in self._made]).reshape(-1, 7)
+        totals = np.array([self._totals(each) for each in self]).reshape(-1, 7)
         if group.recorded is not None:
             return GroupEvaluation(totals, False, float(totals[:, 5].mean()), None)
         controls = group.target_steps, known_mean(self.policy)
@@ -75,7 +53,7 @@ class GroupEpisodes(Showing[GroupEpisode]):
     def _known(self) -> Array:
         return np.stack(known_rewards(self.policy))
 
-    def _totals(self, episode: GroupEpisode) -> list[float]:
+    def _totals(self, episode: Episode) -> list[float]:
         """A row of `GroupEvaluation`."""
         cells, kind = self.problem.task.num_cells, self.problem.kind
         before = np.concatenate([episode.start[None], episode.target[:-1]])
@@ -96,10 +74,8 @@ class GroupEpisodes(Showing[GroupEpisode]):
     def _at_once(self) -> int:
         return max(1, min(AT_ONCE, _BELIEFS // 3000) // len(self.problem))
 
-    def _completed(self, begin: int, end: int) -> Iterator[GroupEpisode]:
+    def _completed(self, begin: int, end: int) -> Iterator[Episode]:
         """Simulated once more."""
-        return _numbered(group_episodes(self.policy, self.seeds[begin:end], beliefs=True), begin)
-
-
-def _numbered(episodes: Sequence[GroupEpisode], begin: int) -> Iterator[GroupEpisode]:
-    return (replace(each, number=begin + place) for place, each in enumerate(episodes))
+        found = group_beliefs(self.policy, self.seeds[begin:end])
+        for episode, belief in zip(self[begin:end], found, strict=True):
+            yield replace(episode, belief=belief)

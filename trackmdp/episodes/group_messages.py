@@ -7,12 +7,13 @@ missed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from scipy import sparse
 
+from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.grids import (
     ACTIVE,
     WHOLE_CELLS,
@@ -23,7 +24,6 @@ from trackmdp.episodes.grids import (
     read_grid,
     stamp_of,
 )
-from trackmdp.episodes.group_episode import GroupEpisode
 from trackmdp.episodes.messages import Form
 from trackmdp.episodes.schema import LoggedRun, belief_topic, clock_of, json_bytes
 from trackmdp.episodes.target_colours import shares_of
@@ -32,6 +32,7 @@ from trackmdp.sensing.coverage import Coverage
 _BELIEF = np.dtype([("belief", "<f4")])
 _SAYS, _ACTIVE_SAYS = constant(_BELIEF), constant(ACTIVE)
 _ABOVE, _UPRIGHT = 0.02, {"x": 0, "y": 0, "z": 0, "w": 1}
+_WHITE = {"r": 1, "g": 1, "b": 1, "a": 1}
 _FAINT = 0.4
 """Opacity of a target that was missed."""
 
@@ -49,7 +50,7 @@ class GroupForm(Form):
         """See `Form`."""
         return [belief_topic(target) for target in range(len(self.run.kinds))]
 
-    def layers(self, episode: GroupEpisode, first_tick: int) -> Iterator[dict[str, bytes]]:
+    def layers(self, episode: Episode, first_tick: int) -> Iterator[dict[str, bytes]]:
         """See `Form`."""
         (rows, columns), targets = self.run.size, len(episode.start)
         sensed = episode.action.reshape(-1, rows, columns)
@@ -68,7 +69,7 @@ class GroupForm(Form):
             said["/targets"] = self._scene(episode, t, first_tick + t)
             yield said | {"/part": part_text(stamp, columns / 2, rows / 2)}
 
-    def _scene(self, episode: GroupEpisode, t: int, tick: int) -> bytes:
+    def _scene(self, episode: Episode, t: int, tick: int) -> bytes:
         """The targets that are in the grid, in place of those of the step before."""
         rows, columns = self.run.size
         time, entities = clock_of(tick), []
@@ -76,37 +77,18 @@ class GroupForm(Form):
             row, column = divmod(int(episode.target[t, k]), columns)
             place = {"x": column + 0.5, "y": rows - row - 0.5}
             colour = dict(zip("rgb", shares_of(k), strict=True))
-            disc: dict[str, Any] = {
-                "pose": {"position": place | {"z": _ABOVE}, "orientation": _UPRIGHT}
-            }
-            disc |= {"size": {"x": 0.6, "y": 0.6, "z": 0.01}, "bottom_scale": 1, "top_scale": 1}
-            disc |= {"color": colour | {"a": 1 if episode.located[t, k] else _FAINT}}
-            text: dict[str, Any] = {
-                "pose": {"position": place | {"z": 2 * _ABOVE}, "orientation": _UPRIGHT}
-            }
-            text |= {"billboard": True, "font_size": 0.4, "scale_invariant": False}
-            text |= {"color": {"r": 1, "g": 1, "b": 1, "a": 1}, "text": str(k)}
+            colour["a"] = 1 if episode.located[t, k] else _FAINT
+            size = {"x": 0.6, "y": 0.6, "z": 0.01}
+            disc = _at(place, _ABOVE, size=size, bottom_scale=1, top_scale=1, color=colour)
+            own = {"billboard": True, "font_size": 0.4, "scale_invariant": False, "color": _WHITE}
+            text = _at(place, 2 * _ABOVE, **own, text=str(k))
             entity = {"timestamp": time, "frame_id": "grid", "id": f"target {k}"}
             entities.append(entity | {"cylinders": [disc], "texts": [text]})
         everything = {"timestamp": time, "type": 1, "id": ""}
         return json_bytes({"deletions": [everything], "entities": entities})
 
-    def _episode(
-        self, row: dict[str, Any], said: list[dict[str, Any]], mine: dict[str, list[bytes]]
-    ) -> GroupEpisode:
-        """See `Form`."""
-        found, targets = self._common(row, said), len(self.run.kinds)
-        shape = len(said), targets
-        if any(found[name].shape != shape for name in ("misses", "target", "located")):
-            raise ValueError(f"steps of other than {targets} targets")
-        start = np.array(row["start"], dtype=np.int64)
-        if start.shape != (targets,):
-            raise ValueError(f"starts of other than {targets} targets")
-        start = np.where(start < 0, self.run.cells, start)
-        return GroupEpisode(**found, start=start, belief=self._belief(mine, len(said)))
-
-    def _belief(self, mine: dict[str, list[bytes]], steps: int) -> sparse.csr_array:
-        """`[T · K, M]` of the messages of each target."""
+    def _beliefs(self, mine: dict[str, list[bytes]]) -> dict[str, Any]:
+        """See `Form`: `[T · K, M]` of the messages of each target."""
         run, topics = self.run, self.read_layers
         places = np.arange(run.cells).reshape(run.size)
         rows, columns, masses = [], [], []
@@ -119,4 +101,10 @@ class GroupForm(Form):
                 columns.append(cell[some])
                 masses.append(mass[some])
         entries = np.concatenate(masses), (np.concatenate(rows), np.concatenate(columns))
-        return sparse.csr_array(entries, shape=(steps * len(topics), run.cells))
+        steps = len(mine[topics[0]])
+        return {"belief": sparse.csr_array(entries, shape=(steps * len(topics), run.cells))}
+
+
+def _at(place: Mapping[str, float], height: float, **more: Any) -> dict[str, Any]:
+    """A part of an entity in a place of the grid, upright."""
+    return {"pose": {"position": {**place, "z": height}, "orientation": _UPRIGHT}, **more}

@@ -12,7 +12,6 @@ from typing import Any
 from trackmdp.config import McapConfig
 from trackmdp.config.tree import config_text
 from trackmdp.episodes.batch import Episodes
-from trackmdp.episodes.group_episodes import GroupEpisodes
 from trackmdp.episodes.layouts import write_layout
 from trackmdp.episodes.recover import taken_over
 from trackmdp.episodes.simulate import simulate
@@ -102,7 +101,7 @@ class EpisodeLog:
                 made = simulate(self._world, policy, episodes, seed=self._seed, names=names)
                 self.add(made, facts)
 
-    def add(self, episodes: Episodes | GroupEpisodes, facts: Mapping[str, str]) -> None:
+    def add(self, episodes: Episodes, facts: Mapping[str, str]) -> None:
         """Log simulated episodes; `facts` describes their policy in the log, such as its `label`."""
         if self._writer is not None:
             with self._over_at_failure():

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from trackmdp.episodes.container import Said
-from trackmdp.episodes.episode import Episode, Recording
+from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.grids import grid_messages, read_grids
 from trackmdp.episodes.schema import LoggedRun, json_bytes, tick_of, time_of
 from trackmdp.errors import UserError
@@ -53,7 +53,7 @@ class Form:
             "end_time": str(time_of(first_tick + len(episode) - 1)),
         }
 
-    def steps(self, episode: Recording) -> Iterator[bytes]:
+    def steps(self, episode: Episode) -> Iterator[bytes]:
         """The `/step` messages; of several targets with a number of each in the place of one."""
         (rows, columns), t = self.run.size, np.arange(len(episode))
         there = episode.target < self.run.cells
@@ -61,7 +61,7 @@ class Form:
         # np.nonzero lists (step, sensor) in order of steps: steps 0 0 1 3 with sensors 2 5 4 0. searchsorted finds
         # where steps 1, 2, 3 begin, 2 3 3, and split makes of those [2 5] [4] [] [0].
         active = [each.tolist() for each in np.split(ids, np.searchsorted(steps, t[1:]))]
-        inside = {} if there.ndim == 1 else {"n_present": there.sum(axis=1)}
+        inside = {"n_present": there.sum(axis=1)} if episode.several else {}
         said: dict[str, Any] = {
             "episode": np.full(len(episode), episode.number),
             "t": t,
@@ -97,7 +97,7 @@ class Form:
         covered = None if self._coverage is None else self._coverage.cells(episode.action)
         return grid_messages(episode, self.run.size, first_tick, covered)
 
-    def decode(self, row: dict[str, Any], messages: Iterable[Said]) -> Any:
+    def decode(self, row: dict[str, Any], messages: Iterable[Said]) -> Episode:
         """The episode of a row, from messages among which are its own.
 
         Raises:
@@ -118,33 +118,40 @@ class Form:
 
     def _episode(
         self, row: dict[str, Any], said: list[dict[str, Any]], mine: dict[str, list[bytes]]
-    ) -> Any:
+    ) -> Episode:
         """The episode of a row, the contents of its steps, and its messages by topic."""
-        belief, probability = read_grids(mine["/grid"], self.run.size)
-        modes = self.run.modes
-        return Episode(
-            **self._common(row, said),
-            start=row["start"],
-            belief=belief,
-            probability=probability,
-            mode=np.array([each["mode"] for each in said], dtype=np.int64) if modes else None,
-            start_mode=row["start_mode"] if modes else 0,
+        run, targets = self.run, len(self.run.kinds)
+        misses, target, seen = (
+            np.array([each[name] for each in said], dtype=np.int64)
+            for name in ("n", "target", "obs")
         )
-
-    def _common(self, row: dict[str, Any], said: list[dict[str, Any]]) -> dict[str, Any]:
-        """Parts that an episode of one target and one of several have in common."""
-        target = np.array([each["target"] for each in said], dtype=np.int64)
-        action = np.zeros((len(said), self.run.sensors), dtype=bool)
+        start, shape = np.array(row["start"], dtype=np.int64), (targets,) if targets else ()
+        if start.shape != shape or any(
+            each.shape != (len(said), *shape) for each in (misses, target, seen)
+        ):
+            raise ValueError(f"steps or starts of other than {targets or 1} targets")
+        action = np.zeros((len(said), run.sensors), dtype=bool)
         for t, each in enumerate(said):
             action[t, each["active"]] = True
-        return {
-            "number": row["episode"],
-            "seed": int(row["seed"]),
+        start = np.where(start < 0, run.cells, start)
+        modes = np.array([each["mode"] for each in said], dtype=np.int64) if run.modes else None
+        return Episode(
+            number=row["episode"],
+            seed=int(row["seed"]),
             **{name: row[name] for name in ("policy", "terminated", "truncated")},
-            "misses": np.array([each["n"] for each in said], dtype=np.int64),
-            "action": action,
-            "target": np.where(target < 0, self.run.cells, target),
-            "located": np.array([each["obs"] for each in said]) >= 0,
-            "reward": np.array([each["reward"] for each in said], dtype=np.float32),
-            "first_tick": tick_of(int(row["start_time"])),
-        }
+            start=start if targets else int(start),
+            misses=misses,
+            action=action,
+            target=np.where(target < 0, run.cells, target),
+            located=seen >= 0,
+            reward=np.array([each["reward"] for each in said], dtype=np.float32),
+            mode=modes,
+            first_tick=tick_of(int(row["start_time"])),
+            start_mode=row["start_mode"] if run.modes else 0,
+            **self._beliefs(mine),
+        )
+
+    def _beliefs(self, mine: dict[str, list[bytes]]) -> dict[str, Any]:
+        """Beliefs and probabilities of an episode, from its messages by topic."""
+        belief, probability = read_grids(mine["/grid"], self.run.size)
+        return {"belief": belief, "probability": probability}

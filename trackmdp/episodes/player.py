@@ -29,7 +29,7 @@ from trackmdp.environment.render import (
     around,
     symbols,
 )
-from trackmdp.episodes.episode import Recording
+from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.sentences import sentence
 from trackmdp.sensing.task import Task
 
@@ -39,17 +39,17 @@ once: it stays where it is while the target does not leave 9 x 9 cells."""
 _SHADES = " ·░▒▓"
 
 
-def frame_legend(episode: Recording) -> str:
+def frame_legend(episode: Episode) -> str:
     """What the symbols of a frame mean."""
     found, missed = (
         FOUND_OF_SEVERAL
-        if episode.target.ndim > 1
+        if episode.several
         else (f"{FOUND} target, located", f"{MISSED} target, missed")
     )
     return f"{found}   {missed}   {ON} sensor on   ·░▒▓ where it was expected"
 
 
-def frame(episode: Recording, t: int, task: Task) -> str:
+def frame(episode: Episode, t: int, task: Task) -> str:
     """The grid at a step, of a large one the part around the targets: they, over the sensors on, over the belief."""
     # digitize gives 0 below 1e-6, 1 below .05, ... 4 from .5 on: an index into the shades.
     levels = np.digitize(episode.expected(t), [1e-6, 0.05, 0.2, 0.5])
@@ -133,7 +133,7 @@ class Playing:
         self.paused = self.t == self.steps - 1
 
 
-def play(console: Console, episode: Recording, task: Task, speed: float) -> None:
+def play(console: Console, episode: Episode, task: Task, speed: float) -> None:
     """Show an episode until it is quit, or all its steps as text where there is no terminal to play at."""
     if not (console.is_terminal and sys.stdin.isatty()):
         for t in range(len(episode)):
@@ -179,7 +179,7 @@ PICTURE_WIDE = 21
 """Rows and columns of a grid that are drawn at most in each frame of a picture."""
 
 
-def draw_picture(episodes: Sequence[Recording], task: Task, *, steps: int = 6) -> str:
+def draw_picture(episodes: Sequence[Episode], task: Task, *, steps: int = 6) -> str:
     """The first `steps` steps of an episode, side by side, under the legend.
 
     Of a grid larger than `PICTURE_WIDE` only the part around the targets.

@@ -16,7 +16,7 @@ from tensordict import TensorDict
 from trackmdp.config import train_config_of
 from trackmdp.episodes import schema
 from trackmdp.episodes.container import Container, Damaged, reading
-from trackmdp.episodes.episode import first_difference
+from trackmdp.episodes.differences import first_difference
 from trackmdp.episodes.group_messages import form_of
 from trackmdp.episodes.schema import LoggedRun, versions_apart
 from trackmdp.episodes.simulate import resimulate
@@ -28,7 +28,7 @@ from trackmdp.training.group_run import joint_policy
 from trackmdp.untrusted import load_npz
 from trackmdp.world.group import Group
 from trackmdp.world.problem import Problem
-from trackmdp.world.problem_file import PROBLEM, problem_in
+from trackmdp.world.problem_file import PROBLEM, subject_in
 
 
 class EpisodeReader:
@@ -105,7 +105,7 @@ class EpisodeReader:
         return self._rows[number]
 
     def read(self, number: int) -> Any:
-        """Episode `number`, an `Episode`, or a `GroupEpisode` of several targets."""
+        """Episode `number`, an `Episode`, or a `Episode` of several targets."""
         row = self.row(number)
         with reading(self.file):
             ends = int(row["start_time"]), int(row["end_time"])
@@ -157,19 +157,12 @@ class EpisodeReader:
         return self._built
 
     def _world(self) -> Problem | Group:
-        run = self.run
-        kinds: list[Any] = [
-            problem_in(io.BytesIO(self.attachment(name))) for name in run.tables[1:]
-        ]
-        for problem in kinds:
-            found = problem.size, problem.total_sensors, problem.t_max
-            if found != (run.size, run.sensors, run.t_max):
-                raise Damaged(PROBLEM)
-        if not run.kinds:
-            return kinds[0]
-        if kinds[0].model is None:
-            return Group.of_tracks(kinds[0], len(run.kinds))
-        return Group([kinds[kind] for kind in run.kinds])
+        run, problem = self.run, subject_in(io.BytesIO(self.attachment(PROBLEM)))
+        task = problem.task
+        found = task.size, task.total_sensors, task.t_max, problem.targets
+        if found != (run.size, run.sensors, run.t_max, run.kinds):
+            raise Damaged(PROBLEM)
+        return problem
 
     def check_all(self) -> None:
         """Check every byte of the file, those without meaning to this reader included."""

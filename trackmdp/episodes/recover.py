@@ -15,7 +15,7 @@ from mcap.records import Attachment, Chunk, DataEnd, Metadata
 from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged, Said
 from trackmdp.episodes.group_messages import form_of
-from trackmdp.episodes.schema import LoggedRun
+from trackmdp.episodes.schema import TABLES, LoggedRun
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
 from trackmdp.untrusted import reason
@@ -152,7 +152,7 @@ def _begin(file: Path, target: Path, parts: _Parts, damaged: list[str]) -> Episo
         run = LoggedRun(file, parts.metadata[schema.RUN])
         with _noting(damaged):
             # Without the problem, the log could not be simulated again.
-            tables = {n: parts.attached(n, run.said.get(f"{n}.sha256")) for n in run.tables}
+            tables = {n: parts.attached(n, run.said.get(f"{n}.sha256")) for n in TABLES}
             return EpisodeWriter(target, run, tables)
     return None
 

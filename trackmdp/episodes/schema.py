@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import math
 import platform
@@ -179,14 +180,9 @@ TABLES = ("config.yaml", PROBLEM)
 """Attachments that every log begins with: the run's config, and the world or the held-out tracks."""
 
 
-def numbered(name: str, kind: int) -> str:
-    """The attachment `name` of one of the motions of several targets."""
-    return name if kind == 0 else f"{Path(name).stem}-{kind}.npz"
-
-
 def policy_file(number: int, kind: int = 0) -> str:
-    """The attachment with the table of a policy."""
-    return numbered(f"policy-{number}.npz", kind)
+    """The attachment with the table of a policy; of several targets for one of their motions."""
+    return f"policy-{number}.npz" if kind == 0 else f"policy-{number}-{kind}.npz"
 
 
 def table_digest(kind: int) -> str:
@@ -223,28 +219,12 @@ class LoggedRun:
             self.sensors = int(said.get("sensors", self.cells))
             self.modes, self.t_max = int(said.get("modes", 0)), int(said["t_max"])
             self.kinds = tuple(map(int, said.get("targets", "").split()))
-            if len(self.kinds) > MOST_TARGETS or any(
-                kind not in {0, *(each + 1 for each in self.kinds[:k])}
-                for k, kind in enumerate(self.kinds)
-            ):
-                raise ValueError("targets of other motions than those in the file")
-
-    @property
-    def motions(self) -> range:
-        """Numbers of the motions."""
-        return range(max(self.kinds, default=0) + 1)
-
-    @property
-    def tables(self) -> list[str]:
-        """The attachments that the log begins with."""
-        return [*TABLES, *(numbered(PROBLEM, kind) for kind in self.motions[1:])]
+            if len(self.kinds) > MOST_TARGETS:
+                raise ValueError("too many targets")
 
     def policy_tables(self, number: int, facts: Mapping[str, str]) -> dict[str, str]:
         """Name -> digest of the attachments with the tables of a policy; empty where it has none."""
-        if not facts[table_digest(0)]:
-            return {}
-        # The weights of networks that read all targets are in one file.
-        kinds = (0,) if facts.get("merge") == "joint" else self.motions
+        kinds = itertools.takewhile(lambda kind: facts.get(table_digest(kind)), itertools.count())
         return {policy_file(number, kind): facts[table_digest(kind)] for kind in kinds}
 
     @property

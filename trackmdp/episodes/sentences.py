@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from trackmdp.arrays.types import BoolArray
-from trackmdp.episodes.episode import Recording
+from trackmdp.episodes.episode import Episode
 from trackmdp.sensing.task import Task
 from trackmdp.world.model import World
 
@@ -34,11 +34,10 @@ def mode_words(world: World, mode: int) -> str:
     )
 
 
-def sentence(episode: Recording, t: int, task: Task) -> str:
+def sentence(episode: Episode, t: int, task: Task) -> str:
     """A step in one line; with the target's mode, where `task` is a world of targets that have one."""
     forced = bool(episode.forced(task.t_max)[t])
-    one = episode.target.ndim == 1
-    found = _found(episode, t, task) if one else _of_several(episode, t, task, forced=forced)
+    found = _of_several(episode, t, task, forced) if episode.several else _found(episode, t, task)
     misses = " ".join(map(str, np.atleast_1d(episode.misses[t])[:_NAMED]))
     if np.size(episode.misses[t]) > _NAMED:
         misses = f"up to {episode.misses[t].max()}"
@@ -47,7 +46,7 @@ def sentence(episode: Recording, t: int, task: Task) -> str:
     return f"step {t + 1} of {len(episode)}: {found}; {on}{misses} misses before; {reward}"
 
 
-def _found(episode: Recording, t: int, task: Task) -> str:
+def _found(episode: Episode, t: int, task: Task) -> str:
     """What became of the one target."""
     if episode.target[t] == task.num_cells:
         return "the target has left the grid"
@@ -61,7 +60,7 @@ def _found(episode: Recording, t: int, task: Task) -> str:
     return found
 
 
-def _of_several(episode: Recording, t: int, task: Task, *, forced: bool) -> str:
+def _of_several(episode: Episode, t: int, task: Task, forced: bool) -> str:
     """What became of each target, or of many of them together."""
     target, located = episode.target[t], episode.located[t]
     lead, inside = "safe action forced, " if forced else "", target < task.num_cells

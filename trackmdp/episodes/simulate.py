@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from trackmdp.arrays.numbers import whole_number
-from trackmdp.arrays.types import AnyArray
 from trackmdp.environment.paths import PathSampler, path_sampler
 from trackmdp.episodes.actors import Actor, States, actor_of
 from trackmdp.episodes.batch import Episodes
-from trackmdp.episodes.episode_draws import Columns, Draws, joined, uniform
+from trackmdp.episodes.episode_draws import Columns, Draws, joined, narrow, uniform
 from trackmdp.episodes.group_episodes import GroupEpisodes
+from trackmdp.episodes.group_simulate import group_columns
 from trackmdp.errors import UserError
 from trackmdp.machine import check_free
 from trackmdp.policies.acting import Playback
@@ -62,7 +62,7 @@ def simulate(
     seed: int = 0,
     names: Sequence[str | int] = (),
     **of_group: Any,
-) -> Episodes | GroupEpisodes:
+) -> Episodes:
     """Independent episodes of a policy, each followed to its own end.
 
     Keeping the first ones to finish would favour short episodes; here every episode that is begun is kept.
@@ -119,7 +119,8 @@ def resimulate(
     See `simulate`.
     """
     if isinstance(policy, Rule):
-        return GroupEpisodes(policy, seeds)
+        # Of no episode one is simulated, as below.
+        return GroupEpisodes.of(policy.group, policy, seeds, group_columns(policy, seeds or [0]))
     assert not isinstance(problem, Group)
     outcomes, sampler = Outcomes(problem), path_sampler(problem, held_out=True)
     actor = actor_of(problem.task, policy, Costs(problem))
@@ -201,7 +202,7 @@ class _Batch:
             {} if choice.action is None else {"bits": np.packbits(choice.action.numpy(), axis=-1)}
         )
         self._taken.append(
-            {name: _narrow(column.numpy()) for name, column in columns.items()} | bits
+            {name: narrow(column.numpy()) for name, column in columns.items()} | bits
         )
         # `[R']`, the positions of those still running: only they are carried over, so that a step's cost falls as
         # episodes end.
@@ -218,8 +219,3 @@ class _Batch:
             return torch.ones_like(place, dtype=torch.bool)
         stops = self._sampler.stops(place)
         return torch.zeros_like(place, dtype=torch.bool) if stops is None else stops
-
-
-def _narrow(column: AnyArray) -> AnyArray:
-    """A copy, since an expanded tensor has no memory of its own; cells and counts fit into 32 bits."""
-    return column.astype(np.int32) if column.dtype == np.int64 else column.copy()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from trackmdp.arrays.types import BoolArray
-from trackmdp.episodes.episode import Recording
+from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.episode_page import MOST_STEPS
 from trackmdp.episodes.sentences import sentence
 from trackmdp.episodes.target_colours import colour_of
@@ -19,7 +19,7 @@ from trackmdp.sensing.task import Task
 _DPI = 110
 
 
-def write_video(file: Path, task: Task, episode: Recording, speed: int) -> None:
+def write_video(file: Path, task: Task, episode: Episode, speed: int) -> None:
     """Write one frame for each step: belief, cells sensed, the target and its last ten moves.
 
     Args:
@@ -65,7 +65,7 @@ def _writer(file: Path, speed: int) -> Any:
     return FFMpegWriter(speed)
 
 
-def _frame(axes: Any, task: Task, episode: Recording, t: int) -> None:
+def _frame(axes: Any, task: Task, episode: Episode, t: int) -> None:
     """Draw a step."""
     axes.clear()
     rows, columns = task.size
@@ -76,7 +76,7 @@ def _frame(axes: Any, task: Task, episode: Recording, t: int) -> None:
     down, across = np.divmod(np.flatnonzero(sensed), columns)
     area = 70_000 / max(rows, columns) ** 2
     axes.scatter(across, down, marker="s", facecolors="none", edgecolors=ORANGE, s=area)
-    several = episode.target.ndim > 1
+    several = episode.several
     paths = np.concatenate([[episode.start], episode.target[: t + 1]]).reshape(t + 2, -1)[-11:].T
     for target, path in enumerate(paths):
         colour = colour_of(target) if several else INK

@@ -14,17 +14,16 @@ from mcap.writer import Writer
 from trackmdp.arrays.files import npz_bytes
 from trackmdp.durable import create, sync, sync_folder
 from trackmdp.episodes import schema
-from trackmdp.episodes.episode import Recording
+from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.group_messages import form_of
 from trackmdp.episodes.schema import LoggedRun, time_of
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import packed
-from trackmdp.recordings.tracks import Recorded
 from trackmdp.solvers.several.merging import Rule
 from trackmdp.untrusted import decoded
 from trackmdp.world.group import Group
 from trackmdp.world.problem import Problem
-from trackmdp.world.problem_file import PROBLEM, problem_bytes, problem_in
+from trackmdp.world.problem_file import PROBLEM, problem_bytes, subject_in
 
 FLUSH_STEPS = 100
 """An episode's end closes the chunk once so many steps are in it, and hands it to the operating system."""
@@ -50,26 +49,23 @@ class EpisodeWriter:
 
         Args:
             file: the log.
-            problem: where the episodes take place; each motion of several targets is in a file of its own.
+            problem: where the episodes take place.
             facts: further metadata of the run, such as `seed`.
             config: its `config.yaml`.
 
         Raises:
             UserError: the problem is too large for a log.
         """
-        tables, more = {schema.TABLES[0]: config.encode()}, {}
-        kinds: Sequence[Problem] = [problem] if not isinstance(problem, Group) else problem.kinds
+        logged, more = problem, {}
         if isinstance(problem, Group):
-            more = {"targets": " ".join(map(str, problem.kind.tolist()))}
-            kinds = kinds if problem.recorded is None else [problem.recorded]
-        problem = kinds[0]
-        if isinstance(problem, Recorded):
-            judged = problem.held_out
+            more = {"targets": " ".join(map(str, problem.targets))}
+        if (own := problem.recorded) is not None:
+            judged = own.held_out
             # Those to learn from predict the moves of several targets.
-            known = problem.tracks if more else judged
-            kinds = [replace(problem, tracks=known, validation=judged, loaded={})]
-        names = (schema.numbered(PROBLEM, number) for number in range(len(kinds)))
-        tables |= dict(zip(names, map(problem_bytes, kinds), strict=True))
+            own = replace(own, tracks=own.tracks if more else judged, validation=judged, loaded={})
+            logged = replace(problem, recorded=own) if isinstance(problem, Group) else own
+        tables = {schema.TABLES[0]: config.encode(), PROBLEM: problem_bytes(logged)}
+        problem = problem.single
         modes = getattr(problem, "modes", 1)
         said = {
             **schema.versions(),
@@ -89,7 +85,7 @@ class EpisodeWriter:
     def __init__(self, file: Path, run: LoggedRun, tables: Mapping[str, bytes]) -> None:
         self.run = run
         with decoded(f"file={file}", "a log of trackmdp"):
-            self._form = form_of(run, problem_in(io.BytesIO(tables[PROBLEM])).coverage)
+            self._form = form_of(run, subject_in(io.BytesIO(tables[PROBLEM])).task.coverage)
         self.file, self.part = file, file.with_name(f"{file.name}.part")
         self._rows: list[dict[str, Any]] = []
         self.policies = self._unflushed = self._tick = 0
@@ -144,7 +140,7 @@ class EpisodeWriter:
         self.policies += 1
         return self.policies - 1
 
-    def add(self, episode: Recording) -> None:
+    def add(self, episode: Episode) -> None:
         """Append an episode with its belief, as of `Episodes.complete`.
 
         Raises:
@@ -159,7 +155,7 @@ class EpisodeWriter:
         if self._unflushed >= FLUSH_STEPS:
             self.flush()
 
-    def _add_messages(self, episode: Recording, tick: int, row: dict[str, Any]) -> None:
+    def _add_messages(self, episode: Episode, tick: int, row: dict[str, Any]) -> None:
         # Before the first message of the episode: NaN is no JSON, and a time that does not fit into its field makes
         # the Writer raise within a chunk, which finish() could then no longer write.
         if not (np.isfinite(episode.reward).all() and 0 <= tick < 2**37):

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import Any
 
@@ -23,7 +23,6 @@ from trackmdp.config.compose import compose, default, given
 from trackmdp.config.sensors import LARGEST_PRICE
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers.solution import Solution
 from trackmdp.solvers.solve import run_solver
 from trackmdp.solvers.tradeoff import ROUNDING, Corner, Tradeoff, height, slope, upper_hull
 from trackmdp.solvers.value import value_of
@@ -158,7 +157,16 @@ class _Trace:
         """The policy of one price; its line, and itself if it is a corner, are kept."""
         world = replace(self.world, cost=price * self.weights)
         found = run_solver(world, self.choice, start=start)
-        corner = self.corner(price, found)
+        figures = found.evaluation
+        # The same for every policy: sensing does not move the target.
+        self.steps = float(figures.steps.mean())
+        safe = world.safe_cost / world.reward * figures.safe_per_episode / self.steps
+        corner = Corner(
+            **{each.name: getattr(found, each.name) for each in fields(found)},
+            price=price,
+            sensors=self.spent(found.table, figures.sensors_per_step),
+            net=figures.accuracy - safe,
+        )
         self.slopes.append(price / world.reward)
         self.bounds.append(corner.upper / (world.reward * self.steps))
         self.hull = upper_hull([*self.hull, corner])
@@ -166,16 +174,6 @@ class _Trace:
         if found.interrupted:
             raise KeyboardInterrupt
         return corner
-
-    def corner(self, price: float, found: Solution) -> Corner:
-        """A policy with its place in the plane."""
-        world, figures = self.world, found.evaluation
-        # The same for every policy: sensing does not move the target.
-        self.steps = float(figures.steps.mean())
-        safe = world.safe_cost / world.reward * figures.safe_per_episode / self.steps
-        return Corner(
-            price, found, self.spent(found.table, figures.sensors_per_step), figures.accuracy - safe
-        )
 
     def spent(self, table: PolicyTable, sensors: float) -> float:
         """Sensors per step, each counted with its price over the mean one."""
@@ -196,8 +194,10 @@ class _Trace:
     def refine(self) -> None:
         """Solve at the slope of the edge that may be farthest below a further corner, until all are resolved."""
         while (edge := self.widest()) is not None:
-            self.report(edge[0])
-            left, right = edge[1:]
+            room, left, right = edge
+            if self.on_progress is not None:
+                seconds = time.monotonic() - self.started
+                self.on_progress(FrontierProgress(len(self.slopes), len(self.hull), room, seconds))
             self.solve(slope(left, right) * self.world.reward, start=left.table)
 
     def widest(self) -> tuple[float, Corner, Corner] | None:
@@ -216,11 +216,6 @@ class _Trace:
         widest = max(rooms, key=lambda room: room[0], default=None)
         enough = self.resolution if self.near is None else ROUNDING
         return None if widest is None or widest[0] <= enough else widest
-
-    def report(self, left: float) -> None:
-        if self.on_progress is not None:
-            seconds = time.monotonic() - self.started
-            self.on_progress(FrontierProgress(len(self.slopes), len(self.hull), left, seconds))
 
     def result(self) -> Tradeoff:
         return Tradeoff(

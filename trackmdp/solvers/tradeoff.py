@@ -15,115 +15,72 @@ D = 0, net is the accuracy itself. The safe action counts as no sensor.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
-from numbers import Real
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from trackmdp.arrays.numbers import REAL
 from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, decimal, percent
-from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.solution import Solution
-
-if TYPE_CHECKING:  # torch is loaded where a policy is to act
-    from trackmdp.policies.policy import Policy
 
 ROUNDING = 1e-10
 """Height above a chord, relative to the figures, that counts as rounding."""
 
 
-@dataclass(frozen=True)
-class Corner:
-    """A policy at a corner of the frontier.
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Corner(Solution):
+    """A policy at a corner of the frontier: the solution at the price at which it was found.
 
     Attributes:
-        price: c, of a sensor for one step, at which the policy was found.
-        solution: the policy, its exact figures and the bracket at this price.
+        price: c, of a sensor for one step.
         sensors: sensors per step in the grid; where their prices differ, each counts as its price over the mean one.
         net: accuracy less D / r for each safe action, per step in the grid.
     """
 
     price: float
-    solution: Solution = field(repr=False)
     sensors: float
     net: float
 
     @property
-    def policy(self) -> Policy:
-        """The policy as a TensorDict module."""
-        return self.solution.policy
-
-    @property
-    def table(self) -> PolicyTable:
-        """The sets of the policy."""
-        return self.solution.table
-
-    @property
-    def evaluation(self) -> Evaluation:
-        """Exact figures at this price."""
-        return self.solution.evaluation
-
-    @property
     def accuracy(self) -> float:
         """Detections per step in the grid, forced ones included."""
-        return self.solution.evaluation.accuracy
-
-    @property
-    def aihtr(self) -> float:
-        """Lower end of the bracket: the AIHTR of the policy at this price."""
-        return self.solution.lower
+        return self.evaluation.accuracy
 
     @property
     def upper(self) -> float:
-        """Upper end of the bracket: no policy has a higher AIHTR at this price."""
-        return max(self.solution.upper, self.solution.lower)
-
-    @property
-    def certified(self) -> bool:
-        """Whether the bracket is closed."""
-        return self.solution.certified
+        """No policy has a higher AIHTR at this price."""
+        return max(super().upper, self.lower)
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """A draw between two neighbouring corners at the start of each episode.
+    """A draw between two neighbouring corners at the start of each episode, or one of them alone.
 
     Attributes:
-        above: the corner at or above the value asked for.
-        below: its neighbour below; None where `above` is used alone.
-        weight: probability of `above`.
+        parts: probability and corner; first the corner at or above the value asked for.
+        accuracy: detections per step in the grid.
+        sensors: sensors per step in the grid.
+        net: accuracy less D / r for each safe action.
     """
 
-    above: Corner
-    below: Corner | None
-    weight: float
+    parts: list[tuple[float, Corner]]
+    accuracy: float
+    sensors: float
+    net: float
 
-    @property
-    def parts(self) -> list[tuple[float, Corner]]:
-        """Probability and corner, of each that is drawn with a positive one."""
-        drawn = [(self.weight, self.above)]
-        if self.below is not None:
-            drawn.append((1.0 - self.weight, self.below))
-        return [(weight, corner) for weight, corner in drawn if weight > 0]
-
-    @property
-    def accuracy(self) -> float:
-        """Detections per step in the grid."""
-        return sum(weight * corner.accuracy for weight, corner in self.parts)
-
-    @property
-    def sensors(self) -> float:
-        """Sensors per step in the grid."""
-        return sum(weight * corner.sensors for weight, corner in self.parts)
-
-    @property
-    def net(self) -> float:
-        """Accuracy less D / r for each safe action."""
-        return sum(weight * corner.net for weight, corner in self.parts)
+    @classmethod
+    def of(cls, *parts: tuple[float, Corner]) -> Mixture:
+        """The mixture of corners that are drawn with these probabilities."""
+        drawn = [(weight, corner) for weight, corner in parts if weight > 0]
+        means = (
+            sum(weight * getattr(corner, name) for weight, corner in drawn)
+            for name in ("accuracy", "sensors", "net")
+        )
+        return cls(drawn, *means)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -220,19 +177,17 @@ class Tradeoff(Carded):
             >>> round(frontier(make_world("drift", size=3)).at(accuracy=0.9).accuracy, 9)
             0.9
         """
-        if (accuracy is None) == (sensors is None):
-            given = "neither" if accuracy is None else "both"
-            raise UserError(f"expected exactly one of accuracy and sensors, got {given}")
-        for name, value in (("accuracy", accuracy), ("sensors", sensors)):
-            if not isinstance(value, Real | None):
-                raise UserError(f"{name}: a {type(value).__name__}, expected a number")
-        if accuracy is not None:
-            return self._mixture("accuracy", accuracy, [c.accuracy for c in self.corners])
-        assert sensors is not None
-        last = self.corners[-1]
-        if sensors >= last.sensors:
-            return Mixture(last, None, 1.0)
-        return self._mixture("sensors", sensors, [c.sensors for c in self.corners])
+        asked: dict[str, Any] = {"accuracy": accuracy, "sensors": sensors}
+        given = {name: value for name, value in asked.items() if value is not None}
+        if len(given) != 1:
+            raise UserError(f"expected exactly one of accuracy and sensors, got {len(given)}")
+        ((name, wanted),) = given.items()
+        if not isinstance(wanted, REAL):
+            raise UserError(f"{name}: a {type(wanted).__name__}, expected a number")
+        values = [getattr(corner, name) for corner in self.corners]
+        if name == "sensors" and wanted >= values[-1]:
+            return Mixture.of((1.0, self.corners[-1]))
+        return self._mixture(name, float(wanted), values)
 
     def _mixture(self, name: str, wanted: float, values: Sequence[float]) -> Mixture:
         """The first corner of at least the wanted value, with as much of the corner before as fits."""
@@ -244,10 +199,10 @@ class Tradeoff(Carded):
             raise UserError(f"{name}={wanted}: expected a number from {lowest:g}{most}")
         place = reached.index(True)
         if place == 0:
-            return Mixture(self.corners[0], None, 1.0)
-        below, above = values[place - 1], values[place]
+            return Mixture.of((1.0, self.corners[0]))
+        below, above = values[place - 1 : place + 1]
         weight = min(1.0, (wanted - below) / (above - below))
-        return Mixture(self.corners[place], self.corners[place - 1], weight)
+        return Mixture.of((weight, self.corners[place]), (1.0 - weight, self.corners[place - 1]))
 
 
 class Placed(Protocol):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,8 +41,6 @@ from trackmdp.world.group import Group, Subject
 _SCORED = 32
 """Episodes by which a policy is scored while it learns: with corrected means (`GroupEvaluation.aihtr`) enough to see
 it grow."""
-FIGURES = ("aihtr", "reward_per_step", "accuracy", "sensors_per_step", "safe_per_step")
-"""Figures of a policy in reports and tables."""
 
 
 class GroupEvaluator(Evaluator):
@@ -156,15 +155,12 @@ class Several:
 
     def report(self) -> dict[str, Any]:
         """As `summary.json` has it."""
-        found, solution = self.figures, self.solution
+        solution = self.solution
         return {
             "targets": len(self.group),
             "merge": self.merge,
-            "exact": found.exact,
-            "episodes": 0 if found.exact else len(found.totals),
-            "expected_length": found.expected_length,
-            "figures": _intervals(found),
-            "merged_optimum": None if self.merged is None else _intervals(self.merged),
+            **self.figures.report(),
+            "merged_optimum": None if self.merged is None else self.merged.report()["figures"],
             "apart": None if solution is None else solution.apart,
             "lower": None if solution is None else solution.lower,
             "upper": self.upper,
@@ -175,20 +171,18 @@ class Several:
         policies = {name: self.figures, **self.fixed}
         if self.merged is not None:
             policies["merged optimum"] = self.merged
-        shown = ("aihtr", "reward_per_step", "accuracy", "sensors_per_step")
         rows = [
-            [name, *(with_ends(getattr(each, figure)) for figure in shown)]
+            [name, *(with_ends(found) for found in list(each.figures.values())[:4])]
             for name, each in policies.items()
         ]
+        bounds = {} if math.isnan(self.upper) else {"upper bound": self.upper}
         if self.solution is not None:
-            rows.append(["separate trackers", *self._plain(self.solution.apart)])
-        return [
-            *rows,
-            *([] if math.isnan(self.upper) else [["upper bound", *self._plain(self.upper)]]),
+            bounds = {"separate trackers": self.solution.apart} | bounds
+        length = self.figures.expected_length
+        return rows + [
+            [name, f"{aihtr:,.4f}", f"{aihtr / length:.4f}", "", ""]
+            for name, aihtr in bounds.items()
         ]
-
-    def _plain(self, aihtr: float) -> list[str]:
-        return [f"{aihtr:,.4f}", f"{aihtr / self.figures.expected_length:.4f}", "", ""]
 
 
 def beside(
@@ -205,29 +199,15 @@ def beside(
     """
     group = rule.group
     figures, upper = evaluate_group(rule, width=width, seed=seed), upper_bound(group)
+    found = partial(Several, group, rule.name, figures, upper)
     if group.recorded is not None:
-        return Several(group, rule.name, figures, upper, None, None, _fixed(group))
+        # Each target's sets together.
+        policies = {} if group.task.budget is not None else fixed_policies(group.task)
+        fixed = {name: evaluate(group, policy) for name, policy in policies.items()}
+        return found(None, None, fixed)
     if not cfg.enabled or group.task.max_steps is not None:
-        return Several(group, rule.name, figures, upper, None, None)
-    singles = (
-        tuple(
-            optimal.solve(world, nodes=cfg.nodes, time_limit=cfg.time_limit)
-            for world in group.kinds
-        )
-        if single is None
-        else (single,)
-    )
+        return found(None, None)
+    solve = partial(optimal.solve, nodes=cfg.nodes, time_limit=cfg.time_limit)
+    singles = tuple(map(solve, group.kinds)) if single is None else (single,)
     solution = GroupSolution(group, singles, upper, sum(each.seconds for each in singles))
-    merged = evaluate_group(solution.policy, width=width, seed=seed)
-    return Several(group, rule.name, figures, upper, solution, merged)
-
-
-def _fixed(group: Group) -> dict[str, GroupEvaluation]:
-    """Figures of policies that a learned one is compared with on recorded tracks, each target's sets together."""
-    assert group.recorded is not None
-    policies = {} if group.task.budget is not None else fixed_policies(group.task)
-    return {name: evaluate(group, policy) for name, policy in policies.items()}
-
-
-def _intervals(found: GroupEvaluation) -> dict[str, Any]:
-    return {name: asdict(getattr(found, name)) for name in FIGURES}
+    return found(solution, evaluate_group(solution.policy, width=width, seed=seed))

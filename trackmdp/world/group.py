@@ -50,7 +50,13 @@ class Group(Carded):
         if not worlds or not all(isinstance(world, World) for world in worlds):
             raise UserError(f"Group: expected a list of 1 to {MOST_TARGETS:,} times a World")
         for number, world in enumerate(worlds):
-            if name := _of_one_target(world):
+            of_one = {
+                f"modes={world.modes}": world.modes > 1,
+                "footprints": world.coverage is not None,
+                f"grid.window={world.window}": world.window is not None,
+                f"task.memory={world.memory}": world.memory != "cell",
+            }
+            if name := next(filter(of_one.get, of_one), ""):
                 raise UserError(f"targets: {name}, expected none with several targets")
             if not _alike(world, worlds[0]):
                 raise UserError(
@@ -235,17 +241,6 @@ def learned_in(subject: Subject, count: int, *, joint: bool) -> Subject:
             "target's plan; train on each world, or take a2c, ppo or dqn"
         )
     return subject.single
-
-
-def _of_one_target(world: World) -> str | None:
-    """A part of a world that several targets do not have; None where it has none."""
-    parts = {
-        f"modes={world.modes}": world.modes > 1,
-        "footprints": world.coverage is not None,
-        f"grid.window={world.window}": world.window is not None,
-        f"task.memory={world.memory}": world.memory != "cell",
-    }
-    return next((name for name, there in parts.items() if there), None)
 
 
 def _check_tracks(count: int, parts: Mapping[str, Tracks]) -> None:

@@ -30,9 +30,8 @@ from trackmdp.grid.place import Place, place_arrays, place_in
 from trackmdp.recordings.tracks import Recorded, Tracks
 from trackmdp.sensing.coverage import Coverage
 from trackmdp.untrusted import LARGE, decoded, load_npz, opened
-from trackmdp.world.group import Group, Subject, group_of, one_target
+from trackmdp.world.group import Group, Subject, group_of
 from trackmdp.world.model import World
-from trackmdp.world.problem import Problem
 
 PROBLEM = "problem.npz"
 
@@ -80,11 +79,6 @@ def read_problem(file: Path) -> Subject:
     """
     with opened(file, most=LARGE) as stream, decoded(str(file), "a world or recorded tracks"):
         return subject_in(stream)
-
-
-def problem_in(stream: BinaryIO) -> Problem:
-    """As `subject_in`, of a single target."""
-    return one_target(subject_in(stream), PROBLEM)
 
 
 def subject_in(stream: BinaryIO) -> Subject:

@@ -44,7 +44,7 @@ def test_the_files_hold_every_corner_and_its_policy(
         assert (int(line["corner"]), line["certified"], row["certified"]) == (number, "True", True)
         assert float(line["sensors_per_step"]) == row["sensors_per_step"] == corner.sensors
         assert float(line["accuracy"]) == row["net_accuracy"] == corner.accuracy
-        assert row["aihtr"] == corner.aihtr
+        assert row["aihtr"] == corner.lower
     assert lines[-1]["gap_to_next"] == ""
     assert content["certified"] is True
     assert content["gap"] == found.gap <= content["resolution"] == 1e-3

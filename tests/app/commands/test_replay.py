@@ -17,7 +17,7 @@ from tests.config.cases import composed
 from tests.reads import record_reads, unread
 from trackmdp.app.cli import main
 from trackmdp.app.prepare import Prepared
-from trackmdp.episodes.episode import first_difference
+from trackmdp.episodes.differences import first_difference
 from trackmdp.episodes.layouts import layout as layout_of
 from trackmdp.episodes.player import Playing, frame
 from trackmdp.episodes.reader import EpisodeReader

@@ -22,13 +22,13 @@ from trackmdp.config import (
     to_yaml,
 )
 from trackmdp.durable import write_json, write_text
-from trackmdp.episodes.batch import Episodes, Simulation
+from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.filtered import simulate_filter
-from trackmdp.episodes.group_episodes import GroupEpisodes
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.player import draw_picture
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.simulate import resimulate, simulate
+from trackmdp.episodes.simulated_figures import Simulation
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import counted_words, grid_words
 from trackmdp.policies.acting import Playback
@@ -48,7 +48,6 @@ from trackmdp.training.devices import make_device
 from trackmdp.training.display import make_console, show_held_out, table, with_interval
 from trackmdp.training.evaluator import CELL_ALONE, ExactEvaluator, HeldOutEvaluator
 from trackmdp.training.folders import SUMMARY, check_files, read_summary
-from trackmdp.training.group_run import FIGURES
 from trackmdp.training.run import trained
 from trackmdp.world.group import Group, Subject, group_of, one_target
 from trackmdp.world.make import false_alarm
@@ -142,20 +141,16 @@ def _several(
     rule = group_rule(group, policy, cfg.targets.merge)
     with at.status("simulating all targets"):
         found = evaluate_group(rule, width=cfg.evaluation.width, seed=cfg.seed)
-    figures, upper = {name: getattr(found, name) for name in FIGURES}, upper_bound(group)
-    apart, recorded = None, group.recorded
+    apart, recorded, upper = None, group.recorded, upper_bound(group)
     if rule.tables:  # else it was learned for all targets together
         # On recorded tracks each is in one of the groups, some of which have fewer targets.
         each = len(group) if recorded is None else len(recorded.held_out) / len(found.totals)
         apart = each * evaluate(group.single, policy, per_cell=False).aihtr
-    report = {"policy": subject, "targets": len(group), "merge": rule.name, "exact": found.exact}
-    report |= {"episodes": 0 if found.exact else len(found.totals), "apart": apart, "upper": upper}
-    report["expected_length"] = found.expected_length
-    report["figures"] = {name: asdict(each) for name, each in figures.items()}
-    write_json(folder / "evaluation.json", report)
+    report = {"policy": subject, "targets": len(group), "merge": rule.name, **found.report()}
+    write_json(folder / "evaluation.json", report | {"apart": apart, "upper": upper})
     rows = [
         [_FIGURES.get(name, name.replace("_", " ")), with_ends(each)]
-        for name, each in figures.items()
+        for name, each in found.figures.items()
     ]
     rows += [] if apart is None else [["AIHTR of separate trackers", f"{apart:,.4f}"]]
     rows += [] if recorded else [["upper bound", f"{upper:,.4f}"]]
@@ -171,7 +166,7 @@ def _several(
 
 def _log(
     cfg: EvaluateConfig,
-    episodes: Episodes | GroupEpisodes,
+    episodes: Episodes,
     subject: str,
     folder: Path,
     console: Console,

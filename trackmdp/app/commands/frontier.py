@@ -75,7 +75,7 @@ def _row(number: int, corner: Corner, found: Tradeoff) -> dict[str, Any]:
         "price": corner.price,
         **_position(corner, found),
         "safe_per_episode": corner.evaluation.safe_per_episode,
-        "aihtr": corner.aihtr,
+        "aihtr": corner.lower,
         "aihtr_upper": corner.upper,
         "certified": corner.certified,
         # Of the edge to the next corner; the last one has none.
@@ -145,7 +145,7 @@ def _show(console: Console, found: Tradeoff, folder: Path) -> None:
         number = round(place * (count - 1) / max(some - 1, 1))
         corner = found.corners[number]
         proof = "yes" if corner.certified else f"< {corner.upper:,.3f}"
-        price, aihtr = f"{corner.price:.5g}", f"{corner.aihtr:,.3f}"
+        price, aihtr = f"{corner.price:.5g}", f"{corner.lower:,.3f}"
         rows.append([f"{number}", price, *_figures(corner, found), aihtr, proof])
     heads = ["corner", "price", *_heads(found), "AIHTR", "certified"]
     more = "" if some == count else f" ({some} of {count} corners; all in frontier.csv)"

@@ -31,14 +31,12 @@ class Chain:
     """All joint states that choices lead to, and their choices.
 
     Attributes:
-        states: number of joint states; the first `starts` are those with all targets located.
-        starts: of them.
+        starts: number of joint states, the first ones, in which all targets have just been located.
         owner: `[C]`, joint state of each choice.
         totals: `[C, 6]`, expected figures of the step (`GroupEvaluation.totals`).
         moves: `[C, states]`, probability of each joint state after it.
     """
 
-    states: int
     starts: int
     owner: IndexArray
     totals: Array
@@ -66,7 +64,7 @@ def joint_chain(rule: Rule) -> Array | None:
     if chain is None:
         return None
     if group.task.max_steps is None:
-        system = sparse.eye_array(chain.states, format="csc") - chain.moves
+        system = sparse.eye_array(chain.moves.shape[0], format="csc") - chain.moves
         found = sparse.linalg.spsolve(sparse.csc_array(system), chain.totals)
     else:
         found = summed_over(chain.moves, chain.totals, group.task.max_steps)
@@ -87,19 +85,18 @@ def explored(group: Group, choices: Callable[[Joint], list[IndexArray]], most: i
     number, first = {each: place for place, each in enumerate(joint)}, len(joint)
     owner, totals = list[int](), list[Array]()
     rows, columns, chances = list[int](), list[int](), list[float]()
-    for place in itertools.count():
-        if place == len(joint):
-            break
-        forced = any(each and each[1] > group.task.t_max for each in joint[place])
-        for on in [np.arange(0)] if forced else choices(joint[place]):
-            row, total = len(owner), np.zeros(6)
-            for chance, after, figures in _steps(group, joint[place], set(on.tolist()), forced):
+    # The list grows while it is gone through.
+    for place, known in enumerate(joint):
+        forced = any(each and each[1] > group.task.t_max for each in known)
+        for on in [np.arange(0)] if forced else choices(known):
+            total = np.zeros(6)
+            for chance, after, figures in _steps(group, known, set(on.tolist()), forced):
                 total += chance * figures
                 if any(after):
                     if after not in number:
                         number[after] = len(joint)
                         joint.append(after)
-                    rows.append(row)
+                    rows.append(len(owner))
                     columns.append(number[after])
                     chances.append(chance)
             owner.append(place)
@@ -107,7 +104,7 @@ def explored(group: Group, choices: Callable[[Joint], list[IndexArray]], most: i
         if len(joint) > most:
             return None
     moves = sparse.csr_array((chances, (rows, columns)), shape=(len(owner), len(joint)))
-    return Chain(len(joint), first, np.array(owner), np.array(totals), moves)
+    return Chain(first, np.array(owner), np.array(totals), moves)
 
 
 def _steps(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from trackmdp.arrays.types import Array
 from trackmdp.notebook.card import Card, Carded, counted_words, decimal
 from trackmdp.statistics import MeanInterval, ratio, student
 
+FIGURES = ("aihtr", "reward_per_step", "accuracy", "sensors_per_step", "safe_per_step")
+"""Figures of a policy in reports and tables."""
 _FREE = 3
 """Degrees of freedom that the corrected mean takes: the mean and two slopes."""
 
@@ -67,7 +70,9 @@ class GroupEvaluation(Carded):
         """Reward per step of an episode, the last exit step included."""
         if self.controls is None:
             return self._ratio(0, 5)
-        return _times(self.aihtr, 1.0 / self.expected_length)
+        found, share = self.aihtr, 1.0 / self.expected_length
+        low, high = (None if end is None else end * share for end in (found.low, found.high))
+        return MeanInterval(found.mean * share, low, high, found.n)
 
     @property
     def accuracy(self) -> MeanInterval:
@@ -106,19 +111,27 @@ class GroupEvaluation(Carded):
         """The word for one of the units that totals are of, and what follows it; see `counted_words`."""
         return ("simulated episode",) if self.controls else ("group", " of held-out tracks")
 
+    @property
+    def figures(self) -> dict[str, MeanInterval]:
+        """The figures by their names."""
+        return {name: getattr(self, name) for name in FIGURES}
+
+    def report(self) -> dict[str, Any]:
+        """As reports in JSON have it."""
+        return {
+            "exact": self.exact,
+            "episodes": 0 if self.exact else len(self.totals),
+            "expected_length": self.expected_length,
+            "figures": {name: asdict(each) for name, each in self.figures.items()},
+        }
+
     def card(self) -> Card:
         """The figures with their intervals."""
-        names = ("aihtr", "reward_per_step", "accuracy", "sensors_per_step", "safe_per_step")
-        facts = {name.replace("_", " "): with_ends(getattr(self, name)) for name in names}
+        facts = {name.replace("_", " "): with_ends(each) for name, each in self.figures.items()}
         facts["steps per episode"] = decimal(self.expected_length, 1)
         return Card(
             f"Evaluation of several targets: {self.about}", {"AIHTR": facts.pop("aihtr")} | facts
         )
-
-
-def _times(found: MeanInterval, factor: float) -> MeanInterval:
-    low, high = (None if end is None else end * factor for end in (found.low, found.high))
-    return MeanInterval(found.mean * factor, low, high, found.n)
 
 
 def with_ends(found: MeanInterval) -> str:

@@ -95,8 +95,7 @@ class GroupTracker:
             ]
         )
         on, moved = np.array(self.sensors(), dtype=np.int64), self._beliefs.moved(self._group)
-        covered = self._policy.task.sees_by_cell[:, on].sum(axis=1) > 0
-        if not self.safe and (seen & ~covered[place]).any():
+        if not self.safe and (seen & ~np.isin(place, on)).any():
             raise UserError(
                 f"report({cells}): a cell is seen by none of the {len(on)} sensors that are on, expected "
                 "one that is, or None"

@@ -6,13 +6,11 @@ for every policy of a group (the generators' names have no policy in them), so t
 
 from __future__ import annotations
 
-import itertools
 import math
 from typing import Any
 
 import numpy as np
 
-from trackmdp.arrays.entries import among
 from trackmdp.arrays.numbers import REAL
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
@@ -20,7 +18,9 @@ from trackmdp.seeding import derive
 from trackmdp.solvers.linear import accumulate, grid_of, summed_over
 from trackmdp.solvers.several.group_chain import joint_chain
 from trackmdp.solvers.several.group_figures import GroupEvaluation
-from trackmdp.solvers.several.merging import Beliefs, Clocks, Reports, Rule, followed
+from trackmdp.solvers.several.merging import Rule
+from trackmdp.solvers.several.simulation import Moving, group_steps
+from trackmdp.world.group import Group
 
 _FIRST = 64
 """Episodes of the first batch, from which the number needed for the wanted width is worked out."""
@@ -48,7 +48,7 @@ def evaluate_group(
         raise UserError(f"width={width}: expected a number > 0")
     group = rule.group
     if group.recorded is not None:
-        found = _Along(rule).totals()
+        found = _totals(rule, _every_group(rule), 0)
         return GroupEvaluation(found, False, float(found[:, 5].mean()), None)
     exact_steps = group.expected_steps, (group.target_steps, known_mean(rule))
     if episodes is None and (exact := joint_chain(rule)) is not None:
@@ -60,34 +60,30 @@ def _played(
     rule: Rule, exact_steps: Any, width: float, seed: int, episodes: int | None
 ) -> GroupEvaluation:
     """See `evaluate_group`; simulated."""
-    first = simulated(rule, min(episodes or _FIRST, _MOST), seed, "first")
-    found = GroupEvaluation(first, False, *exact_steps)
-    parts = [first]
-    while episodes is None and sum(map(len, parts)) < _MOST:
+    parts, wanted, count = list[Array](), min(episodes or _FIRST, _MOST), 0
+    while True:
+        name = f"more {len(parts)}" if parts else "first"
+        parts.append(simulated(rule, max(wanted - count, 1), seed, name))
+        count = sum(map(len, parts))
+        found = GroupEvaluation(np.concatenate(parts), False, *exact_steps)
         now = found.reward_per_step
-        assert now.low is not None
-        assert now.high is not None
-        half, count = (now.high - now.low) / 2, sum(map(len, parts))
+        if episodes is not None or count >= _MOST or now.low is None or now.high is None:
+            return found
+        half = (now.high - now.low) / 2
         if half <= width:
-            break
+            return found
         # A little more than the law of the square root asks for, so that few rounds are needed.
         wanted = min(math.ceil(count * min(1.05 * half / width, 3.0) ** 2), 8 * count, _MOST)
-        parts.append(simulated(rule, max(wanted - count, 1), seed, f"more {len(parts)}"))
-        found = GroupEvaluation(np.concatenate(parts), False, *exact_steps)
-    return found
 
 
 def simulated(rule: Rule, episodes: int, seed: int, name: str) -> Array:
     """`[E, 7]` totals of simulated episodes, as in `GroupEvaluation`."""
-    each = max(1, _AT_ONCE // len(rule.group))
-    begins = range(0, episodes, each)
-    batches = [min(each, episodes - begin) for begin in begins]
-    return np.concatenate(
-        [
-            _Batch(rule, count, derive(seed, "group", name, number)).totals()
-            for number, count in enumerate(batches)
-        ]
-    )
+    each, parts = max(1, _AT_ONCE // len(rule.group)), list[Array]()
+    for number, begin in enumerate(range(0, episodes, each)):
+        own = derive(seed, "group", name, number)
+        rng = np.random.default_rng(derive(own, "motion"))
+        parts.append(_totals(rule, _Drawn(rule.group, min(each, episodes - begin), rng), own))
+    return np.concatenate(parts)
 
 
 def known_rewards(rule: Rule) -> list[Array]:
@@ -112,130 +108,62 @@ def known_mean(rule: Rule) -> float:
     return sum(means[kind] for kind in rule.group.kind)
 
 
-class _Batch:
-    """E episodes stepped together.
+class _Drawn:
+    """Targets of E episodes that move by their motions, all starts and moves drawn from one generator."""
 
-    Args:
-        rule: the policy.
-        episodes: E.
-        seed: of all draws.
-    """
+    state: IndexArray
+    inside: BoolArray
 
-    def __init__(self, rule: Rule, episodes: int, seed: int) -> None:
-        self.rule, self.group, self.task = rule, rule.group, rule.task
-        self.shape = (episodes, len(rule.group))
-        self.moves = np.random.default_rng(derive(seed, "motion"))
-        self.reports = np.random.default_rng(derive(seed, "reports"))
-        kernel = self.group.kernel
-        self.states, self.cells = kernel.shape[0], self.task.num_cells
+    def __init__(self, group: Group, episodes: int, rng: np.random.Generator) -> None:
+        self._kernel, self._rng = group.kernel, rng
         # Sums of all rows, one after the other: the first of row z is at `sums[indptr[z]]`.
-        self.sums = np.concatenate([[0.0], np.cumsum(kernel.data)])
-        self.known = np.concatenate(known_rewards(rule))
-        self.clocks = self._start()
-        self.place = self.clocks.located
+        self._sums = np.concatenate([[0.0], np.cumsum(self._kernel.data)])
+        cells, shape = group.task.num_cells, (episodes, len(group))
+        cell = np.random.default_rng(rng.integers(2**63)).integers(cells, size=shape)
+        self.state, self.inside = cell + group.kind * cells, np.ones(shape, dtype=bool)
 
-    def _start(self) -> Clocks:
-        cell = np.random.default_rng(self.moves.integers(2**63)).integers(
-            self.cells, size=self.shape
-        )
-        return self.rule.start(cell + self.group.kind * self.cells)
+    def move(self, row: IndexArray, step: int) -> None:  # noqa: ARG002
+        """See `Moving`; every draw is made in every step."""
+        begin, end = self._kernel.indptr[self.state], self._kernel.indptr[self.state + 1]
+        wanted = self._sums[begin] + self._rng.random(self.state.shape)
+        entry = np.searchsorted(self._sums, wanted, side="right") - 1
+        self.inside = self.inside & (entry < end)
+        self.state = self.state.copy()
+        self.state[self.inside] = self._kernel.indices[entry[self.inside]]
 
-    def totals(self) -> Array:
-        """`[E, 7]`."""
-        beliefs, found = Beliefs.of(self.clocks), np.zeros((self.shape[0], 7))
-        moved = Beliefs.at(*np.zeros((2, 0), dtype=np.int64))
-        for _ in itertools.count() if self.task.max_steps is None else range(self.task.max_steps):
-            if not self.clocks.present.any():
-                break
-            if not self.rule.reads_history:
-                moved = beliefs.moved(self.group)
-            found[:, 6] += (self.known[self.place] * self.clocks.present).sum(axis=1)
-            on = self.rule.sets(self.clocks, moved)
-            beliefs = self._step(moved, on, found)
-        return found
-
-    def _step(self, moved: Beliefs, on: IndexArray, found: Array) -> Beliefs:
-        """One step with the sensors `on`; adds to the totals, and returns the beliefs after it."""
-        task, clocks, shape = self.task, self.clocks, self.shape
-        before = clocks.present
-        forced = clocks.late(task.t_max)
-        on = on[~forced[on // self.cells]]
-        self.place, present = self._moved(before)
-        episode = np.broadcast_to(np.arange(shape[0])[:, None], shape)
-        cell = self.place % self.cells
-        report = among(on, episode * self.cells + cell)[1] | forced[:, None]
-        if not (task.perfect and task.safe):
-            chance = np.where(forced[:, None], task.safe_detection[cell], task.detection[cell])
-            report &= self.reports.random(shape) < chance
-        seen = present & report
-        self._add(found, on, seen, present, before, forced)
-        reports = self._followed(present, seen)
-        self.clocks, beliefs = followed(self.group, clocks, moved, on, self.place, reports)
-        return beliefs
-
-    def _moved(self, before: BoolArray) -> tuple[IndexArray, BoolArray]:
-        """Places after a move, and which targets are in the grid; every draw is made in every step."""
-        kernel = self.group.kernel
-        begin, end = kernel.indptr[self.place], kernel.indptr[self.place + 1]
-        wanted = self.sums[begin] + self.moves.random(self.shape)
-        entry = np.searchsorted(self.sums, wanted, side="right") - 1
-        present = before & (entry < end)
-        place = self.place.copy()
-        place[present] = kernel.indices[entry[present]]
-        return place, present
-
-    def _followed(self, present: BoolArray, seen: BoolArray) -> Reports:
-        """Which targets are followed on after a step, and which of them were located."""
-        return present, seen
-
-    def _add(
-        self,
-        found: Array,
-        on: IndexArray,
-        seen: BoolArray,
-        present: BoolArray,
-        before: BoolArray,
-        forced: BoolArray,
-    ) -> None:
-        task, count = self.task, self.shape[0]
-        any_left, episode = present.any(axis=1), on // self.cells
-        price = np.bincount(episode, task.paid[on % self.cells], count)
-        spent = np.where(forced, task.safe_cost, price) * any_left
-        detections = seen.sum(axis=1)
-        found[:, 0] += task.reward * detections - spent
-        found[:, 1] += present.sum(axis=1)
-        found[:, 2] += detections
-        found[:, 3] += np.bincount(episode, minlength=count) * any_left
-        found[:, 4] += forced & any_left
-        found[:, 5] += before.any(axis=1)
+    def ended(self) -> BoolArray:
+        """See `Moving`."""
+        return ~np.any(self.inside, axis=1)
 
 
-class _Along(_Batch):
+def _every_group(rule: Rule) -> Moving:
     """All groups of held-out tracks, of which each is an episode."""
+    # torch is loaded where targets are moved along tracks
+    from trackmdp.environment.group_paths import GroupPaths, Walks
 
-    def __init__(self, rule: Rule) -> None:
-        # torch is loaded where targets are moved along tracks
-        from trackmdp.environment.group_paths import AlongTracks
+    paths = GroupPaths(rule.group, held_out=True)
+    return Walks(paths, paths.every())
 
-        assert rule.group.recorded is not None
-        self.paths = AlongTracks(rule.group.recorded, len(rule.group), held_out=True)
-        self.at = self.paths.every()
-        super().__init__(rule, len(self.at), 0)
 
-    def _start(self) -> Clocks:
-        return self.rule.start(*self._cells())
-
-    def _cells(self) -> tuple[IndexArray, BoolArray]:
-        """`[E, K]`, cells of the targets, and whether they are in the grid."""
-        return self.paths.cell(self.at).numpy(), self.paths.inside(self.at).numpy()
-
-    def _moved(self, before: BoolArray) -> tuple[IndexArray, BoolArray]:
-        self.at = self.paths.move(self.at, 0 * self.at)  # which is certain
-        cell, inside = self._cells()
-        self.entered = inside & ~before
-        return cell, inside & before
-
-    def _followed(self, present: BoolArray, seen: BoolArray) -> Reports:
-        # Where all recordings stop that are left, the episode is over.
-        inside = (present | self.entered) & ~self.paths.ended(self.at).numpy()[:, None]
-        return inside, (seen | self.entered) & inside
+def _totals(rule: Rule, targets: Moving, seed: int) -> Array:
+    """`[E, 7]` totals of episodes stepped together, as in `GroupEvaluation`."""
+    task, shape = rule.task, targets.state.shape
+    rng = np.random.default_rng(derive(seed, "reports"))
+    found, known = np.zeros((shape[0], 7)), np.concatenate(known_rewards(rule))
+    place = targets.state
+    for step in group_steps(rule, targets, lambda *_: rng.random(shape), predicted=False):
+        before, present, detections = step.before.present, step.present, step.seen.sum(axis=1)
+        some, episode = present.any(axis=1), step.on // rule.cells
+        price = np.bincount(episode, task.paid[step.on % rule.cells], shape[0])
+        columns = (
+            task.reward * detections - np.where(step.late, task.safe_cost, price) * some,
+            present.sum(axis=1),
+            detections,
+            np.bincount(episode, minlength=shape[0]) * some,
+            step.late & some,
+            before.any(axis=1),
+            (known[place] * before).sum(axis=1),
+        )
+        found += np.stack(columns, axis=1)
+        place = targets.state
+    return found

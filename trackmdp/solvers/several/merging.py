@@ -86,6 +86,11 @@ class Beliefs:
         return cls(row, state, np.ones(len(row)))
 
     @classmethod
+    def none(cls) -> Beliefs:
+        """No entries, for a policy that reads none."""
+        return cls.at(*np.zeros((2, 0), dtype=np.int64))
+
+    @classmethod
     def of(cls, clocks: Clocks) -> Beliefs:
         """At the start, where the targets that are there are located."""
         rows = np.flatnonzero(clocks.present)
@@ -117,13 +122,13 @@ class Beliefs:
         row, mass = self.row[some], mass[some]
         return Beliefs(row, self.state[some], mass / per_row(row, mass, rows)[row])
 
-    def joined(self, other: Beliefs, states: int) -> Beliefs:
-        """The entries of both, in order."""
+    def joined(self, other: Beliefs) -> Beliefs:
+        """The entries of both in order; no row is in both."""
         parts = [
             np.concatenate([getattr(self, name), getattr(other, name)])
             for name in ("row", "state", "mass")
         ]
-        order = np.argsort(parts[0] * states + parts[1], kind="stable")
+        order = np.argsort(parts[0], kind="stable")
         return Beliefs(*(part[order] for part in parts))
 
 
@@ -183,13 +188,6 @@ class Union(Rule):
     """Each target's own set, all of them together."""
 
     name = "union"
-
-    def __init__(self, group: Group, tables: Sequence[PolicyTable]) -> None:
-        super().__init__(group, tables)
-        if self.task.budget is not None:
-            raise UserError(
-                f"targets.merge=union: expected gains with a budget, {self.task.budget}"
-            )
 
     def sets(self, seen: Clocks, moved: Beliefs) -> IndexArray:  # noqa: ARG002
         """See `Rule`."""
@@ -279,6 +277,8 @@ def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str | None = N
         merge = "gains" if known else "union"
     if merge not in kinds:
         raise UserError(f"merge={merge}: expected gains or union")
+    if merge == "union" and (budget := group.task.budget) is not None:
+        raise UserError(f"targets.merge=union: expected gains with a budget, {budget}")
     return kinds[merge](group, tables)
 
 
@@ -302,7 +302,7 @@ def followed(
     chance = np.where(late[episode], task.safe_detection[cell], chance)
     left = moved.given(missed, np.asarray(chance, dtype=np.float64), missed.size)
     again = np.flatnonzero(seen.ravel())
-    found = left.joined(Beliefs.at(again, place.ravel()[again]), group.kernel.shape[0])
+    found = left.joined(Beliefs.at(again, place.ravel()[again]))
     # A target that has left keeps no clock; one that the safe action missed is due for the next one.
     misses = np.where(present & ~seen, np.minimum(clocks.misses + 1, task.t_max + 1), 0)
     located = np.where(seen, place, clocks.located)

@@ -17,7 +17,7 @@ from stonesoup.types.track import Track
 from stonesoup.types.update import StateUpdate
 
 from trackmdp.arrays.types import BoolArray
-from trackmdp.episodes.episode import Recording, last_cells
+from trackmdp.episodes.episode import Episode, last_cells
 from trackmdp_stone_soup.places import Places, ends_with_exit
 from trackmdp_stone_soup.sensors import PolicySensorManager
 
@@ -88,7 +88,7 @@ def _reports(manager: PolicySensorManager, truth: GroundTruthState) -> list[True
     return [report for sensor in manager.sensors for report in sensor.measure({truth})]
 
 
-def seen_of(episode: Recording, places: Places) -> list[Track]:
+def seen_of(episode: Episode, places: Places) -> list[Track]:
     """What was known of each target of an episode, as a track that ends when it leaves the grid.
 
     A track has one state a step: an update where its target was located, else its last known place.
