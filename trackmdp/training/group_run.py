@@ -147,11 +147,9 @@ class Several:
     def score(self) -> Score:
         """The means, and their regrets."""
         found = means(self.figures)
-        if math.isnan(self.upper):
-            return Score(found, math.nan, math.nan)
-        best = max(each.aihtr.mean for each in (self.figures, self.merged) if each is not None)
-        upper, lower = (regret_per_step(end, found) for end in (self.upper, best))
-        return Score(found, upper, lower)
+        known = [each.aihtr.mean for each in (self.figures, self.merged) if each is not None]
+        best = math.nan if math.isnan(self.upper) else max(known)
+        return Score(found, *(regret_per_step(end, found) for end in (self.upper, best)))
 
     def report(self) -> dict[str, Any]:
         """As `summary.json` has it."""

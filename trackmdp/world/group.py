@@ -11,7 +11,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.arrays.numbers import whole_number
-from trackmdp.arrays.types import Array, Indices
+from trackmdp.arrays.types import Indices
 from trackmdp.config.several import MOST_TARGETS
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, grid_words
@@ -123,11 +123,6 @@ class Group(Carded):
     def kernel(self) -> sparse.csr_array:
         """`[Z, Z]` moves of all kinds, one block after the other: state z of kind k is k · M + cell."""
         return sparse.block_diag([each.kernel for each in self.kinds], "csr")
-
-    @cached_property
-    def stay_probability(self) -> Array:
-        """`[Z]`, of `kernel`."""
-        return np.concatenate([world.stay_probability for world in self.kinds])
 
     @property
     def expected_steps(self) -> float:
