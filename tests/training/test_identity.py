@@ -173,8 +173,6 @@ def test_what_another_run_left_is_not_taken(
 @pytest.mark.parametrize(
     "damage",
     [
-        {"position": {"iteration": -1}},
-        {"position": {"iteration": 8, "frames": 10**30, "seconds": 0.0, "reward": 0.0}},
         {"versions": [1]},
         {"versions": {"nope": "1"}},
         {"algorithm": [1]},

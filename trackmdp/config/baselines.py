@@ -50,21 +50,21 @@ class QmdpConfig(BaselineConfig):
 class AllOnConfig(BaselineConfig):
     """All sensors on, always."""
 
-    without_motion: ClassVar[bool] = True
+    without_motion = True
 
 
 @choice("baseline", "none", makes="trackmdp.policies.policy:Policy.none")
 class NoSensorsConfig(BaselineConfig):
     """No sensor on until the safe action is forced."""
 
-    without_motion: ClassVar[bool] = True
+    without_motion = True
 
 
 @choice("baseline", "random_k", makes="trackmdp.policies.policy:Policy.random_k")
 class RandomKConfig(BaselineConfig):
     """k sensors drawn at random each step."""
 
-    without_motion: ClassVar[bool] = True
+    without_motion = True
     k: int = option("sensors switched on, at most as many as there are", unit="sensors", ge=0)
 
     def check(self, key: str, root: Any) -> None:
@@ -100,8 +100,8 @@ class FcrConfig(BaselineConfig):
 class LookaheadConfig(BaselineConfig):
     """Plan some sets ahead, then count on a simpler value."""
 
-    knows_footprints: ClassVar[bool] = False
-    knows_budget: ClassVar[bool] = False
+    knows_footprints = False
+    knows_budget = False
 
     depth: int = count_option("sets planned ahead", unit="steps", le=16)
     tail: str = option("value counted on after them", choices=("qmdp", "clocked"))
@@ -111,7 +111,7 @@ class LookaheadConfig(BaselineConfig):
 class OptimalConfig(BaselineConfig):
     """Policy iteration, search and branch and bound: the optimum with a certificate, or an honest bracket."""
 
-    whole_episodes: ClassVar[bool] = True
+    whole_episodes = True
 
     nodes: int = count_option(
         "choices of branch and bound after which the bracket is left as it is", unit="nodes"
@@ -133,7 +133,7 @@ class OptimalConfig(BaselineConfig):
 class SetsConfig(BaselineConfig):
     """The sets in a file of evaluate, solve, export or a run."""
 
-    without_motion: ClassVar[bool] = True
+    without_motion = True
     file: str = file_option("the sets", "a sets.json, or a sets.npz or policy.npz")
 
 

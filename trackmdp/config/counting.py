@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 from trackmdp.config.learning import EveryTaskConfig, renewed_table
 from trackmdp.config.options import (
@@ -25,7 +25,7 @@ class ModelBasedConfig(EveryTaskConfig):
     Pooled moves where the next move depends on the cell alone, whole paths where it does not.
     """
 
-    knows_budget: ClassVar[bool] = True
+    knows_budget = True
     sensing: str | None = option(
         "all sensors on, or sets chosen by posterior sampling; null: all, with cost.budget chosen",
         choices=("all", "chosen"),

@@ -124,7 +124,7 @@ class HindsightConfig(PerSensorConfig):
 class PolicyGradientConfig(PerSensorConfig):
     """Common options of A2C and PPO with a credit per sensor."""
 
-    effort: ClassVar[float] = 1.6
+    effort = 1.6
     entropy: ScheduleConfig = nested(ENTROPY)
 
 

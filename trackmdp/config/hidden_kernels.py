@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Any, ClassVar
+from typing import Any
 
 from trackmdp.config.checks import unknown_option, validate
 from trackmdp.config.options import (
@@ -34,7 +34,7 @@ class HiddenKernelConfig(KernelConfig):
     `reveals` is no argument of it.
     """
 
-    hides: ClassVar[bool] = True
+    hides = True
     reveals: bool = option(
         "whether a detection reveals the mode as well (Doppler, AIS); false: the cell alone"
     )

@@ -81,15 +81,15 @@ class AlgoConfig(ChoiceConfig):
 class EveryTaskConfig(AlgoConfig):
     """Base of the algorithms that learn with every memory, revealed mode and footprint."""
 
-    remembers: ClassVar[bool] = True
-    knows_footprints: ClassVar[bool] = True
+    remembers = True
+    knows_footprints = True
 
 
 class NetworkConfig(EveryTaskConfig):
     """Common options of the algorithms with networks that learn from their own sensing."""
 
-    knows_budget: ClassVar[bool] = True
-    joint: ClassVar[bool] = True
+    knows_budget = True
+    joint = True
     gamma: float = share_option("discount while learning; policies are evaluated undiscounted")
     learning_rate: ScheduleConfig = nested(LEARNING_RATE)
     max_grad_norm: float = option("gradients are clipped to this norm", gt=0)

@@ -35,14 +35,14 @@ class CsvConfig(RowsConfig):
 class TensorboardConfig(RowsConfig):
     """TensorBoard event files."""
 
-    package: ClassVar[str | None] = "tensorboard"
+    package = "tensorboard"
 
 
 @choice("log", "wandb", makes="trackmdp.training.loggers:WandbLogger")
 class WandbConfig(RowsConfig):
     """Weights & Biases. `wandb sync` uploads an offline log, in the folder of the run."""
 
-    package: ClassVar[str | None] = "wandb"
+    package = "wandb"
     mode: str = option(
         "offline = to files alone, online = to the server", choices=("offline", "online")
     )
@@ -53,7 +53,7 @@ class WandbConfig(RowsConfig):
 class MlflowConfig(RowsConfig):
     """MLflow, in a database or on a server."""
 
-    package: ClassVar[str | None] = "mlflow"
+    package = "mlflow"
     uri: str | None = option(
         "tracking database or server; null = mlflow.db in the run's folder", expects="a URI"
     )
@@ -64,7 +64,7 @@ class MlflowConfig(RowsConfig):
 class McapConfig(LogConfig):
     """`episodes.mcap`: simulated episodes, step by step, for `replay` and viewers."""
 
-    episodes_only: ClassVar[bool] = True
+    episodes_only = True
     evaluations: int = count_option(
         "training: from one recorded evaluation to the next; the last is recorded too",
         unit="evaluations",

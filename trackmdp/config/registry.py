@@ -34,7 +34,7 @@ from omegaconf.errors import (
 )
 
 from trackmdp.config.learning import MOST_FRAMES
-from trackmdp.config.options import GROUPS, ChoiceConfig, options
+from trackmdp.config.options import GROUPS, ChoiceConfig
 from trackmdp.errors import UserError, message_of
 
 ENTRY_POINTS = "trackmdp.plugins"
@@ -57,12 +57,7 @@ def maker(node: ChoiceConfig | type[ChoiceConfig]) -> Callable[..., Any]:
 
 def make(node: ChoiceConfig, *args: Any, **more: Any) -> Any:
     """Call the code of a choice with `args`, the options of the choice by name, and `more`."""
-    return maker(node)(*args, **options_of(node), **more)
-
-
-def options_of(node: ChoiceConfig) -> dict[str, Any]:
-    """The options of a choice, by name."""
-    return {name: getattr(node, name) for name in options(type(node))}
+    return maker(node)(*args, **vars(node), **more)
 
 
 @lru_cache(maxsize=1)

@@ -101,8 +101,8 @@ class ComputingConfig(WorldConfig):
 class TrainConfig(ComputingConfig):
     """Learn a policy without the motion model, and evaluate it exactly."""
 
-    needs_motion: ClassVar[bool] = False
-    learns: ClassVar[bool] = True
+    needs_motion = False
+    learns = True
     seed: int = option("every random draw of the run derives from it", ge=0)
     task: TaskConfig
     algo: AlgoConfig
@@ -133,7 +133,7 @@ class TrainConfig(ComputingConfig):
 class EvaluateConfig(ComputingConfig):
     """Value a trained policy (run=) or a baseline (baseline=), exactly and by simulation."""
 
-    needs_motion: ClassVar[bool] = False
+    needs_motion = False
     task: TaskConfig
     run: str | None = file_option(
         "folder of a training run; its world is taken from there", "the folder of a run"
@@ -170,7 +170,7 @@ class EvaluateConfig(ComputingConfig):
 class CompareConfig(WorldConfig):
     """Policies side by side on one problem: the one of the first run, else the world of the options."""
 
-    needs_motion: ClassVar[bool] = False
+    needs_motion = False
     task: TaskConfig
     runs: list[str] | None = file_option(
         "folders of training runs; run=A run=B is the same as runs=[A,B]", "the folder of a run"
@@ -206,8 +206,8 @@ class FrontierConfig(WorldConfig):
     D stays as it is, and its payments count; cost.safe=0 leaves them out.
     """
 
-    all_prices: ClassVar[bool] = True
-    any_number: ClassVar[bool] = True
+    all_prices = True
+    any_number = True
     task: TaskConfig
     solver: BaselineConfig
     accuracy: float | None = share_option(
@@ -229,7 +229,7 @@ class FrontierConfig(WorldConfig):
 class VerifyConfig(WorldConfig):
     """Check the paper's theorems on a world."""
 
-    any_number: ClassVar[bool] = True
+    any_number = True
     tolerance: float = option("deviation that still counts as equal", unit="reward", gt=0, lt=1)
 
     def check(self, key: str, root: Any) -> None:

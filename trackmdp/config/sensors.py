@@ -197,7 +197,7 @@ class FalseAlarmConfig(SensorConfig):
 class FootprintConfig(MissConfig):
     """Wide sensors: each covers several cells, and reports a target in any of them with probability p_d of its cell."""
 
-    covers: ClassVar[bool] = True
+    covers = True
     radius: float = option(
         "distance from its own cell to the centres of the cells that a sensor covers",
         unit="cells",

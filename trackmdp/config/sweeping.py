@@ -79,7 +79,7 @@ class LauncherConfig(PluginConfig):
 class BasicConfig(LauncherConfig):
     """One run after the other, on this machine."""
 
-    concurrent: ClassVar[bool] = False
+    concurrent = False
 
 
 @choice("hydra/launcher", "joblib", makes="trackmdp.app.sweep.launchers:run_joblib")

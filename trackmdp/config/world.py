@@ -218,7 +218,7 @@ class TableConfig(KernelConfig):
 class TracksConfig(KernelConfig):
     """No motion model but recorded tracks: learn from most of them, choose by some, and judge on those held out."""
 
-    is_motion: ClassVar[bool] = False
+    is_motion = False
     path: str = file_option(
         "file of cells (columns track, cell, or row and column, and, if wanted, step), or of positions",
         "a path to a .csv, .npz, .parquet, .geojson, .gpx, .txt (MOT-Challenge) or .xml (SUMO) file",

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, overload
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.by_blocks import SweptPartitionConfig
 from trackmdp.config.compose import compose, default, given
-from trackmdp.config.registry import make, maker, options_of
+from trackmdp.config.registry import make, maker
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.linear import DIRECT_CELLS
@@ -167,7 +167,7 @@ def _modes(
     from trackmdp.solvers import hidden
 
     if choice.name == "optimal":
-        return hidden.solve(world, start=start, on_progress=on_progress, **options_of(choice))
+        return hidden.solve(world, start=start, on_progress=on_progress, **vars(choice))
     started = time.monotonic()
     made = make(choice, hidden.averaged(world))
     table = made.table if isinstance(made, Solution) else made

@@ -101,17 +101,16 @@ def _sentence(first: Compared, other: Compared, unit: str, *, exact: bool) -> st
     """The difference of a policy to the first, and whether it is shown."""
     found = other.difference
     more = f"{decimal(abs(found.mean))} {'more' if found.mean > 0 else 'less'} per {unit}"
-    if exact and abs(found.mean) <= _SAME * max(abs(first.figures["aihtr"].mean), 1.0):
-        return f"{other.name} earns the same as {first.name} (exact)."
     if exact:
-        return f"{other.name} earns {more} than {first.name} (exact)."
-    if found.low is None or found.high is None:
+        same = abs(found.mean) <= _SAME * max(abs(first.figures["aihtr"].mean), 1.0)
         return (
-            f"{other.name} earns {more} than {first.name}; the {unit}s are too few for an interval."
+            f"{other.name} earns {'the same as' if same else f'{more} than'} {first.name} (exact)."
         )
-    interval = f"95 % interval of the difference: {decimal(found.low)} to {decimal(found.high)}"
-    if found.low <= 0.0 <= found.high:
-        return f"No difference between {other.name} and {first.name} is shown; {interval}."
+    interval = f"the {unit}s are too few for an interval"
+    if found.low is not None and found.high is not None:
+        interval = f"95 % interval of the difference: {decimal(found.low)} to {decimal(found.high)}"
+        if found.low <= 0.0 <= found.high:
+            return f"No difference between {other.name} and {first.name} is shown; {interval}."
     return f"{other.name} earns {more} than {first.name}; {interval}."
 
 
@@ -147,12 +146,16 @@ def compare(problem: Subject, policies: Mapping[str, Any] | Sequence[Any]) -> Co
     tables = _made(problem, named, partial(_table, problem))
     if problem.recorded is not None:
         return _on_tracks(problem.recorded, tables)
-    rows: list[Compared] = []
-    for name, table in tables.items():
-        found = value_of(problem, table, per_cell=False)
-        figures = {key: _exact(getattr(found, key)) for key in FIGURES}
-        first = (rows[0].figures if rows else figures)["aihtr"].mean
-        rows.append(Compared(name, figures, _exact(found.aihtr - first)))
+    found = {name: value_of(problem, table, per_cell=False) for name, table in tables.items()}
+    first, *_ = found.values()
+    rows = (
+        Compared(
+            name,
+            {key: _exact(getattr(each, key)) for key in FIGURES},
+            _exact(each.aihtr - first.aihtr),
+        )
+        for name, each in found.items()
+    )
     return Comparison(tuple(rows), None)
 
 
@@ -161,16 +164,16 @@ def _on_tracks(problem: Recorded, tables: Mapping[str, Policy]) -> Comparison:
     tracks = problem.held_out.limited(problem.max_steps)
     target = np.unique(tracks.names, return_inverse=True)[1]
     count = np.bincount(target).astype(np.float64)
-    rows: list[Compared] = []
-    first = np.zeros(len(count))
-    for name, table in tables.items():
-        found = replay(problem, tracks, table)
-        reward = np.bincount(target, found.totals[:, 0]).astype(np.float64)
-        first = first if rows else reward
-        figures = found.intervals(tracks.names)
-        rows.append(
-            Compared(name, {key: figures[key] for key in FIGURES}, ratio(reward - first, count))
-        )
+    found = {name: replay(problem, tracks, table) for name, table in tables.items()}
+    rewards = {
+        name: np.bincount(target, each.totals[:, 0]).astype(float) for name, each in found.items()
+    }
+    first, *_ = rewards.values()
+    rows = []
+    for name, each in found.items():
+        figures = each.intervals(tracks.names)
+        less = ratio(rewards[name] - first, count)
+        rows.append(Compared(name, {key: figures[key] for key in FIGURES}, less))
     return Comparison(tuple(rows), len(tracks))
 
 

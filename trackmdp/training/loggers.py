@@ -75,23 +75,25 @@ class CsvLogger(RowLogger):
             UserError: the file is a link, or not the one that the earlier process left.
         """
         self._path = self._folder / "metrics.csv"
-        # The columns are read and checked before the file is opened for writing: a file that is refused
-        # stays as it was.
-        names = _names(self._path, self._position) if self._position else None
+        names: list[str] = []
+        if self._position:
+            source = str(self._path)
+            with opened(self._path, most=2**36) as stream, decoded(source, "this run's metrics"):
+                names = next(csv.reader([stream.readline(2**16).decode()], strict=True))
+                # A file system without fsync may have lost the last rows.
+                if names[0] != "iteration" or stream.seek(0, os.SEEK_END) < self._position:
+                    raise ValueError(f"expected {self._position:,} bytes with a head of columns")
         descriptor = reopen(self._path, empty=not self._position)
         self._file = os.fdopen(descriptor, "r+", newline="", encoding="utf-8")
-        self._writer: csv.DictWriter[str] | None = None
-        if names is not None:
-            self._writer = csv.DictWriter(self._file, fieldnames=names)
-            # Rows after the checkpoint are of iterations that are run again: left in place they would
-            # stand there twice.
-            self._file.truncate(self._position)
-            self._file.seek(0, os.SEEK_END)
+        self._writer = csv.DictWriter(self._file, names)
+        # Rows after the checkpoint are of iterations that are run again: left in place they would stand there twice.
+        self._file.truncate(self._position)
+        self._file.seek(0, os.SEEK_END)
 
     def write(self, row: Row) -> None:
         """Append `row`; it is on its way to the disk at once."""
-        if self._writer is None:
-            self._writer = csv.DictWriter(self._file, fieldnames=list(row))
+        if not self._writer.fieldnames:
+            self._writer.fieldnames = list(row)
             self._writer.writeheader()
         self._writer.writerow(known(row))
         # Flushed to the operating system, not synced: after a kill the rows are there, and others can watch
@@ -113,25 +115,6 @@ class CsvLogger(RowLogger):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Resume the file at the length it had when the state was taken."""
         self._position = state["position"]
-
-
-def _names(file: Path, position: int) -> list[str]:
-    """The columns of a table that has at least `position` bytes.
-
-    Raises:
-        UserError: it has fewer, or is no such table.
-    """
-    with opened(file, most=2**36) as stream, decoded(str(file), "the metrics of this run"):
-        head = stream.readline(2**16)
-        stream.seek(position - 1)
-        # Shorter than at the checkpoint, or without a row's end there: the file was changed meanwhile, and cut at this
-        # byte it would end in half a row.
-        if stream.read(1) != b"\n":
-            raise ValueError(f"no row ends at byte {position:,}, where the checkpoint was saved")
-        names = next(csv.reader([head.decode("utf-8")], strict=True))
-        if names[0] != "iteration":
-            raise ValueError(f"the first column is {names[0]}, expected iteration")
-        return names
 
 
 class ResultLogger(RowLogger):

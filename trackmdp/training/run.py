@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import json
+import math
 import platform
 import time
 from collections.abc import Mapping
@@ -41,6 +43,7 @@ from trackmdp.untrusted import LARGE, decoded, read_text
 from trackmdp.world.group import Subject, group_of, one_target
 from trackmdp.world.problem import Problem
 
+_PROVED = ("lower", "upper", "certified", "timed_out")
 _PACKAGES = ("torch", "torchrl", "tensordict", "hydra-core", "numpy", "scipy")
 Metrics = dict[str, list[float | int | None]]
 """Columns by their names, as in `metrics.csv`: one value for each logged iteration, None for missing figures."""
@@ -137,10 +140,8 @@ def _complete(trainer: Learning) -> Run:
     # time.
     recorded = trainer.problem.model is None and not trainer.problem.targets
     final = trainer.evaluator.evaluate(policy) if recorded else score.evaluation
-    if solution is not None:
-        score = trainer.evaluator.tighten(
-            solution.lower, solution.upper, score
-        )  # keeps the evaluation that it is of
+    if solution is not None:  # the score keeps the evaluation that it is of
+        score = trainer.evaluator.tighten(solution.lower, solution.upper, score)
     times = {
         "wall_seconds": time.monotonic() - began + trainer.start.seconds,
         "cpu_seconds": time.process_time() - used,
@@ -152,8 +153,7 @@ def _complete(trainer: Learning) -> Run:
         # Last, for a folder with a summary is a finished run.
         write_summary(trainer.folder, summary)
     # A resumed run's earlier rows are in its file alone.
-    metrics = rows.columns if trainer.folder is None else read_metrics(trainer.folder)
-    columns = metrics or rows.columns
+    columns = (trainer.folder and read_metrics(trainer.folder)) or rows.columns
     return Run(policy, final, columns, summary, trainer.folder, solution, several)
 
 
@@ -211,18 +211,13 @@ def _evaluation(folder: Path, summary: Mapping[str, Any], value: Array | None) -
     """The figures of the summary and the values of the policy; other figures per cell are not kept in a folder."""
     with decoded(str(folder / SUMMARY), "the summary of a run"):
         known = {field.name for field in fields(Evaluation)}
-        figures: dict[str, Any] = {
-            name: _number(it) for name, it in summary["policy"].items() if name in known
-        }
-        cells = 0 if value is None else len(value)
-        unknown: dict[str, Any] = dict.fromkeys(known - {*figures, "value"}, np.full(cells, np.nan))
-        return Evaluation(
-            value=np.full(cells, np.nan) if value is None else value, **unknown, **figures
-        )
-
-
-def _number(value: Any) -> float:
-    return float("nan") if value is None else float(value)
+        value = np.empty(0) if value is None else value
+        found: dict[str, Any] = dict.fromkeys(known, np.full(len(value), np.nan))
+        found["value"] = value
+        for name in known & summary["policy"].keys():
+            number = summary["policy"][name]
+            found[name] = math.nan if number is None else float(number)
+        return Evaluation(**found)
 
 
 def read_metrics(folder: Path) -> Metrics:
@@ -235,16 +230,9 @@ def read_metrics(folder: Path) -> Metrics:
         columns: Metrics = {name: [] for name in rows.fieldnames or ()}
         for row in rows:
             for name, column in columns.items():
-                column.append(_cell(row[name]))
+                # As JSON reads it, a number is whole where it was: a float is logged with a point or an exponent.
+                column.append(json.loads(row[name]) if row[name] else None)
     return columns
-
-
-def _cell(text: str) -> float | int | None:
-    """A number as it was logged: whole where it was, None where there is none."""
-    if not text:
-        return None
-    # A float is logged with a point or an exponent (2.0, 1e-05), so that digits alone are an int.
-    return int(text) if text.lstrip("-").isdigit() else float(text)
 
 
 def summarize(
@@ -275,11 +263,7 @@ def summarize(
         "qmdp": figures(evaluator.qmdp) if evaluator.qmdp else None,
         "bounds": evaluator.bounds,
         "references": references(evaluator, solution),
-        "optimal": {
-            key: getattr(solution, key) for key in ("lower", "upper", "certified", "timed_out")
-        }
-        if solution
-        else None,
+        "optimal": solution and {key: getattr(solution, key) for key in _PROVED},
         "regret_per_step": score.regret_per_step,
         "regret_per_step_lower": score.regret_per_step_lower,
         "while_collecting": while_collecting(evaluator.upper, final, end.reward, end.frames),
