@@ -28,7 +28,7 @@ class Kept(Callback):
 
 def _sets(trainer: Training) -> np.ndarray:
     policy = trainer.policy()
-    if policy.sets is None:  # before the first update all sensors are on with one probability
+    if policy.alike:  # before the first update all sensors are on with one probability
         return np.zeros((policy.task.num_cells, policy.task.t_max + 1, policy.task.num_cells), bool)
     return policy.sets.toarray() > 0
 

@@ -197,9 +197,7 @@ def test_batches_and_ways_of_looking_up_change_nothing(
     monkeypatch.setattr("trackmdp.episodes.actors._DRAWS", 100)
     monkeypatch.setattr("trackmdp.episodes.batch._BELIEF", 50)
     monkeypatch.setattr(lookup, "DENSE", 0)
-    acting = Policy(
-        WORLD, ACTING[name].sets, probability=ACTING[name].probability, k=ACTING[name].k
-    )
+    acting = Policy(WORLD, ACTING[name].sets, k=ACTING[name].k)
     for mine, other in zip(simulate(WORLD, acting, 40).complete(), together(name), strict=False):
         assert first_difference(mine, other) is None
 

@@ -134,5 +134,4 @@ def test_every_sensor_of_a_window_is_on_however_it_is_looked_up(t_max: int) -> N
     assert torch.equal(
         everything(state.clone())["action"], Policy(world, everything.sets)(state.clone())["action"]
     )
-    assert everything.sets is not None
     assert (everything.sets.dtype, everything.sets.indices.dtype) == (np.bool_, np.int32)

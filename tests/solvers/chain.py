@@ -139,7 +139,6 @@ class Chain:
 def chain_of(problem: Problem, policy: PolicyTable, others: Sequence[Place] = ()) -> Chain:
     """The chain of a policy with sets, with `others` as if episodes came to them; sensors are independent."""
     target, reports, price = target_of(problem), sees(problem), np.nan_to_num(problem.cost)
-    assert policy.sets is not None
     table = policy.sets.toarray().astype(float)
     number: dict[Place, int] = {}
     places: list[Place] = []

@@ -148,8 +148,7 @@ def lifted(task: Task, table: PolicyTable) -> PolicyTable:
         return table
     keys = np.arange(task.num_keys)
     known = task.keys.cell(keys) * task.revealed + keys % task.revealed
-    assert table.sets is not None
-    return PolicyTable(task, table.sets[block_rows(known, task.num_choices)])
+    return PolicyTable(task, table.written[block_rows(known, task.num_choices)])
 
 
 def choosable_places(task: Task, located: IndexArray, sensors: IndexArray) -> IndexArray:

@@ -13,7 +13,6 @@ from typing import TypeAlias
 
 import numpy as np
 import torch
-from scipy import sparse
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -30,7 +29,6 @@ from trackmdp.policies.forms import (
 )
 from trackmdp.policies.lookup import Lookup
 from trackmdp.policies.policy import Policy, PolicyLike, as_policy
-from trackmdp.policies.table import SetTable
 from trackmdp.sensing.actions import ActionMask
 from trackmdp.sensing.detection import Detection
 from trackmdp.sensing.outcomes import Costs
@@ -152,22 +150,17 @@ def _writing(task: Task, costs: Costs, action_of: Acts) -> Decides:
 
 
 def _following(policy: Policy, costs: Costs) -> Decides:
-    """A deterministic policy: a row of its table for each state, or one for all where all sensors are on, or none."""
-    sets, coverage, alike = policy.sets, policy.task.coverage, policy.sets is None
-    if sets is None:
-        sets = sparse.csr_array(np.full((1, policy.task.total_sensors), policy.probability == 1.0))
-    cpu = torch.device("cpu")
-    if coverage is None:
-        table = Lookup(sets, cpu) if alike else policy.lookup(cpu)
-    else:
-        table = Lookup(SetTable(policy.task, sets, 1).reporting, cpu)
+    """A deterministic policy: the row of its table for each state."""
+    sets, table = policy.sets, policy.lookup(torch.device("cpu"))
+    if policy.task.coverage is not None:
+        table = Lookup(policy.reporting, table.device)
     # A CSR matrix's indptr is the place where each row's entries begin: 0 2 2 5 are rows of 2, 0 and 3 sensors.
     count, spent = torch.as_tensor(np.diff(sets.indptr).astype(np.int64)), costs.of_sets(sets)
 
     detection = Detection(policy.task)
 
     def decide(states: States, draws: Tensor | None) -> Choice:  # noqa: ARG001
-        row = torch.zeros_like(states.key) if alike else policy.row(states.key, states.misses)
+        row = policy.row(states.key, states.misses)
         return Choice(
             count[row], spent[row], lambda cell: detection.of_cell(table.entry(row, cell), cell)
         )

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from trackmdp.arrays.types import Array, BoolArray
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.seeding import derive
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.evaluation import ReplayedTracks
@@ -58,10 +58,7 @@ def simulate_filter(
         reports = on & (chances < np.where(there, world.detection, false_alarm))
         belief = _posterior(world, predicted, on, reports, false_alarm)
         belief[forced] = there[forced]
-        # The likeliest of the cells that reported, where declaring it is worth more than a miss.
-        likely = np.where(reports, belief, 0.0)
-        worth = world.reward * likely.max(axis=1) + (belief * later).sum(axis=1)
-        declared, cell = reports.any(axis=1) & (worth > 0), likely.argmax(axis=1)
+        declared, cell = _declared(world.reward, belief, reports, later)
         right = inside & (forced | (declared & (cell == target)))
         declared |= forced
         price = np.where(forced, world.safe_cost, on @ world.cost)
@@ -71,6 +68,22 @@ def simulate_filter(
         misses = np.where(declared, 0, misses + 1)
         row, target, belief, misses = row[inside], target[inside], belief[inside], misses[inside]
     return ReplayedTracks(totals[:5].T, totals[5], watched)
+
+
+def _declared(
+    reward: float, belief: Array, reports: BoolArray, later: Array
+) -> tuple[BoolArray, IndexArray]:
+    """`[E]` whether to declare the likeliest of the cells that reported, and `[E]` which it is.
+
+    Args:
+        reward: r.
+        belief: `[E, M]`, after the reports.
+        reports: `[E, M]`.
+        later: `[E, M]`, worth of the target located in each cell over a miss.
+    """
+    likely = np.where(reports, belief, 0.0)
+    worth = reward * likely.max(axis=1) + (belief * later).sum(axis=1)
+    return reports.any(axis=1) & (worth > 0), likely.argmax(axis=1)
 
 
 def _posterior(

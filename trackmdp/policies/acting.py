@@ -51,7 +51,7 @@ class RenewedTable(TensorDictModuleBase):
 
     def renew(self, policy: PolicyTable) -> None:
         """Act as the deterministic `policy` from now on."""
-        sets = in_window(self.task, policy.sets)
+        sets = in_window(self.task, policy.written)
         for begin in range(0, len(self.bits), _ROWS_AT_ONCE):
             rows = sets[begin : begin + _ROWS_AT_ONCE].toarray()
             self.bits[begin : begin + len(rows)].copy_(torch.as_tensor(np.packbits(rows, axis=1)))

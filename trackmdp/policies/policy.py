@@ -92,7 +92,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
     @classmethod
     def from_table(cls, table: PolicyTable) -> Policy:
         """The policy that acts by a table."""
-        return cls(table.task, table.sets, probability=table.probability, k=table.k)
+        return cls(table.task, table.sets, k=table.k)
 
     @classmethod
     def random_k(cls, task: Task, k: int) -> Policy:
@@ -101,9 +101,6 @@ class Policy(TensorDictModuleBase, PolicyTable):
         Where fewer than k can be chosen, as in a window at the border, all of them are on.
         """
         near = PolicyTable.all_on(task).sets
-        if task.window is None and task.available.all():
-            return cls(task, probability=k / task.total_sensors, k=k)
-        assert near is not None
         count = np.diff(near.indptr)
         # Each sensor's own probability of being among the k of its window.
         share = np.minimum(k / np.repeat(count, count), 1.0)
@@ -183,27 +180,23 @@ class Policy(TensorDictModuleBase, PolicyTable):
 
     def probabilities(self, key: Tensor, steps_since_detection: Tensor) -> Tensor:
         """`[*B, S]` with which each sensor is switched on: bool for a deterministic policy, else float32."""
-        device, shape = key.device, (*key.shape, self.task.total_sensors)
-        if self.probability is not None:
-            dtype = torch.bool if self.deterministic else torch.float32
-            return torch.full(shape, self.probability, dtype=dtype, device=device)
-        return self.lookup(device)(self.row(key, steps_since_detection))
+        return self.lookup(key.device)(self.row(key, steps_since_detection))
 
     def seeing(self, key: Tensor, steps_since_detection: Tensor) -> Tensor:
         """`[*B, M]` with which a sensor that is on sees each cell: `probabilities`, but for footprints."""
         if self.task.coverage is None:
             return self.probabilities(key, steps_since_detection)
-        if self.sets is None:
-            share = torch.as_tensor(self.share, device=key.device)
-            return share.float().expand(*key.shape, -1)
         return Lookup(self.seen, key.device)(self.row(key, steps_since_detection))
 
     def row(self, key: Tensor, steps_since_detection: Tensor) -> Tensor:
         """`[*B]`, the row of `sets` for a state; where the safe action is forced, the row of the last free choice."""
+        if self.alike:
+            return torch.zeros_like(key)
         return key * self.task.num_choices + steps_since_detection.clamp_max(self.task.t_max)
 
     def lookup(self, device: torch.device, *, local: bool = False) -> Lookup:
         """The rows of `sets` on a device, of all sensors or of those of the window alone."""
+        local &= self.task.numbered is not None
         if (device, local) not in self._lookups:
             table = in_window(self.task, self.sets) if local else self.sets
             self._lookups[device, local] = Lookup(table, device)
@@ -221,7 +214,8 @@ class Policy(TensorDictModuleBase, PolicyTable):
         _check_range(name, key, self.task.num_keys)
         _check_range("steps_since_detection", n, self.task.num_choices + 1)
         if self.deterministic:
-            return tensordict.set("action", self._near(key, n))
+            action = self.lookup(key.device, local=True)(self.row(key, n))
+            return tensordict.set("action", action)
         # A generator draws on its own device only.
         device = last_cell.device if self.generator is None else self.generator.device
         shape = *last_cell.shape, self.task.total_sensors
@@ -230,15 +224,6 @@ class Policy(TensorDictModuleBase, PolicyTable):
         if self.task.numbered is not None:
             action = Window.of(self.task, last_cell.device).to_local(last_cell, action)
         return tensordict.set("action", action)
-
-    def _near(self, key: Tensor, steps_since_detection: Tensor) -> Tensor:
-        """`[*B, K]` bool, the action of a deterministic policy as the environment takes it."""
-        if self.task.numbered is None:
-            return self.act(key, steps_since_detection)
-        if self.sets is None:
-            shape = (*key.shape, self.task.num_sensors)
-            return torch.zeros(shape, dtype=torch.bool, device=key.device)
-        return self.lookup(key.device, local=True)(self.row(key, steps_since_detection))
 
     def tracker(
         self,

@@ -61,16 +61,20 @@ def load_policy(file: Path) -> tuple[PolicyTable, Array | None]:
 
 def packed(policy: PolicyTable) -> dict[str, Any]:
     """A policy as plain arrays: its table or its one probability, and how many sensors it draws."""
-    if policy.sets is None:
-        content: dict[str, Any] = {"probability": np.float64(policy.probability)}
+    sets, content = policy.sets, dict[str, Any]()
+    if (
+        policy.alike
+        and sets.nnz in (0, policy.task.total_sensors)
+        and (sets.data == sets.data[:1]).all()
+    ):
+        content["probability"] = np.float64(sets.data[0] if sets.nnz else 0.0)
     else:
+        sets = policy.written
         # Fixed integer widths: SciPy's own choice depends on the number of entries, and the bytes would with it.
-        content = {
-            "indices": policy.sets.indices.astype(np.int32),
-            "indptr": policy.sets.indptr.astype(np.int64),
-        }
+        content["indices"] = sets.indices.astype(np.int32)
+        content["indptr"] = sets.indptr.astype(np.int64)
         if not policy.deterministic:  # else every entry stored is a sensor on
-            content["data"] = policy.sets.data
+            content["data"] = sets.data
     return content if policy.k is None else content | {"k": np.int64(policy.k)}
 
 
@@ -99,8 +103,7 @@ def listable(policy: PolicyTable) -> bool:
     """Whether the sets are few enough to be written as JSON; always on, 40 x 40 sensors are too many."""
     task = policy.task
     rows = task.num_keys * task.num_choices
-    every = task.total_sensors if policy.probability else 0
-    on = rows * every if policy.sets is None else policy.sets.nnz
+    on = policy.sets.nnz * (rows if policy.alike else 1)
     return task.num_cells <= LISTED_CELLS and rows + on <= LISTED_NUMBERS
 
 
@@ -136,7 +139,7 @@ def read_sets(task: Task, file: str | Path) -> PolicyTable:
         table.check_fits(task)
         made = table.task
         own = task.remembering(made.memory, clip=made.clip, revealed=made.revealed)
-        return PolicyTable(own, table.sets, probability=table.probability, k=table.k)
+        return PolicyTable(own, table.sets, k=table.k)
     if file.suffix != ".json":
         raise UserError(f"{file}: expected a sets.json, or a sets.npz or policy.npz")
     content = read_object(file, most=LARGE)

@@ -17,7 +17,7 @@ from trackmdp.arrays.entries import ones_at, short_indices
 from trackmdp.arrays.types import AnyArray, Array, BoolArray
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, decimal, grid_words
-from trackmdp.sensing.coverage import reported, shared_out
+from trackmdp.sensing.coverage import reported
 from trackmdp.sensing.task import Task, window_cells
 
 _AT_ONCE = 2**19
@@ -31,38 +31,26 @@ class SetTable:
     Args:
         task: sensors and prices.
         sets: `[plans * (t_max + 1), S]` sparse, bool or probabilities; row `plan * (t_max + 1) + n` is the set after n
-            misses. None: `probability` for every sensor in every row.
+            misses. Or one row, which stands for all: then they are `alike`.
         plans: number of plans.
+        k: exactly k sensors of each row are on; see `PolicyTable`.
     """
 
     def __init__(
-        self,
-        task: Task,
-        sets: sparse.csr_array | None,
-        plans: int,
-        *,
-        probability: float | None = None,
-        k: int | None = None,
+        self, task: Task, sets: sparse.csr_array, plans: int, *, k: int | None = None
     ) -> None:
-        self.task = task
-        self.sets = sets
-        self.plans = plans
-        self.probability = probability
-        self.k = k
-        self.deterministic = (
-            probability in (0.0, 1.0) if sets is None else bool(sets.dtype == np.bool_)
-        )
+        self.task, self.sets, self.plans, self.k = task, sets, plans, k
+        self.alike = sets.shape[0] == 1
+        self.deterministic = bool(sets.dtype == np.bool_)
 
     def sensed_by(self, task: Task) -> SetTable:
         """The same sets with the sensors of `task`, which may report with other probabilities."""
         if np.array_equal(self.task.detection, task.detection):
             return self
-        return SetTable(task, self.sets, self.plans, probability=self.probability, k=self.k)
+        return SetTable(task, self.sets, self.plans, k=self.k)
 
     def chosen(self, n: int, plans: AnyArray, sensors: AnyArray) -> Array:
         """`[E]` probability that `sensors` `[E]` are on, after n misses in each plan `[E]`."""
-        if self.sets is None:
-            return np.full(len(plans), float(self.probability or 0.0))
         return self._looked_up(self._chosen, n, plans, sensors)
 
     def reports(self, n: int, plans: AnyArray, cells: AnyArray) -> Array:
@@ -70,8 +58,6 @@ class SetTable:
         task = self.task
         if task.coverage is None:
             return self.chosen(n, plans, cells) * task.detects(cells)
-        if self.sets is None:
-            return self._share[cells]
         return self._looked_up(self._reported, n, plans, cells)
 
     @cached_property
@@ -88,61 +74,40 @@ class SetTable:
         for begin in range(0, len(columns), _AT_ONCE):
             part = slice(begin, begin + _AT_ONCE)
             row = np.asarray(plans[part], dtype=np.int64) * self.task.num_choices + n
+            row = 0 * row if self.alike else row
             found[part] = table[row, columns[part]]
         return found
 
     def spent(self, n: int, price: Array) -> Array:
         """`[plans]` expected price of the sensors on after n misses; `price` `[S]` is per sensor."""
-        if self.sets is None:
-            return np.full(self.plans, (self.probability or 0.0) * float(price.sum()))
+        if self.alike:
+            return np.full(self.plans, (self.sets.toarray() * price).sum())
         # Rows n, n + (t_max + 1), ...: those of (0, n), (1, n), ..., one per plan.
         rows = self.sets[n :: self.task.num_choices]
         return rows.astype(np.float64) @ price
 
     def watched(self, used: Array) -> Array:
         """`[M]` how often each cell is covered, where the sets are used `[plans * (t_max + 1)]` often."""
-        if self.sets is None:
-            return used.sum() * self.share
-        return used @ self.seen
+        return (used.sum(keepdims=True) if self.alike else used) @ self.seen
 
     @cached_property
     def seen(self) -> sparse.csr_array:
-        """`[plans * (t_max + 1), M]`, probability that each cell is sensed; `sets` itself without footprints."""
-        coverage = self.task.coverage
-        if coverage is None:
+        """The rows of `sets`, over cells: probability that each is sensed; `sets` itself without footprints."""
+        if self.task.coverage is None:
             return self.sets
-        found = reported(self.sets, self._covers.T.tocsr(), self.k)
+        covers = sparse.csr_array(self.task.sees_by_cell > 0, dtype=np.float64)
+        found = reported(self.sets, covers.T.tocsr(), self.k)
         return found.astype(np.bool_) if self.deterministic else found
 
     @cached_property
     def reporting(self) -> sparse.csr_array:
-        """`[plans * (t_max + 1), M]`, probability of a report of a target in each cell; bool where all are certain."""
+        """The rows of `sets`, over cells: probability of a report of a target; bool where all are certain."""
         task = self.task
         if task.coverage is not None and not task.perfect:
             return reported(self.sets, task.sees_by_cell.T.tocsr(), self.k)
         if task.perfect:
             return self.seen
-        assert self.sets is not None
         return sparse.csr_array(self.sets.multiply(task.detection))
-
-    @cached_property
-    def _share(self) -> Array:
-        """`[M]`, the same of a report."""
-        return self._shared_out(self.task.sees_by_cell)
-
-    @cached_property
-    def share(self) -> Array:
-        """`[M]`, probability of covering each cell, of a policy without sets, in every state."""
-        return self._shared_out(self._covers)
-
-    def _shared_out(self, sees_by_cell: sparse.csr_array) -> Array:
-        count = int(self.task.available.sum())
-        return shared_out(sees_by_cell, float(self.probability or 0.0), self.k, count)
-
-    @property
-    def _covers(self) -> sparse.csr_array:
-        """`[M, S]` 1.0 where a sensor covers a cell."""
-        return sparse.csr_array(self.task.sees_by_cell > 0, dtype=np.float64)
 
 
 class PolicyTable(Carded, SetTable):
@@ -156,9 +121,8 @@ class PolicyTable(Carded, SetTable):
         sets: `[keys * (t_max + 1), S]` sparse; row `key * (t_max + 1) + n` is the set at n misses after the detection
             that left `key`; S = M, a sensor in each cell, or the sensors of `task.coverage`. Bool entries are sensors
             on; entries in (0, 1] are the probabilities of switching them on, independently of each other and of the
-            history.
-        probability: the same for every sensor in every state, instead of `sets`; where not all sensors exist or lie in
-            the window of the located cell, it holds for the others and is written out as `sets`.
+            history. One row stands for all keys and numbers of misses.
+        probability: of every sensor that can be chosen, in every state, instead of `sets`.
         k: exactly k sensors are on, each such subset equally likely; `sets` or `probability` then has each sensor's
             share of them, which is all that exact values depend on.
 
@@ -185,10 +149,8 @@ class PolicyTable(Carded, SetTable):
             raise UserError(f"policy: expected a probability between 0 and 1, got {probability}")
         if k is not None and not 0 <= k <= task.total_sensors:
             raise UserError(f"policy: expected k from 0 to {task.total_sensors} sensors, got {k}")
-        sets = None if sets is None else _checked(task, sets)
-        if probability and (task.window is not None or not task.available.all()):
-            sets, probability = _choosable_sets(task, probability), None
-        super().__init__(task.task, sets, task.num_keys, probability=probability, k=k)
+        sets = _choosable_sets(task, probability) if sets is None else sets
+        super().__init__(task.task, _checked(task, sets), task.num_keys, k=k)
 
     def card(self) -> Card:
         """Size, memory and the mean number of sensors on."""
@@ -261,8 +223,8 @@ class PolicyTable(Carded, SetTable):
             )
             raise UserError(f"policy: made for {theirs}; expected {ours}")
         gone = self.task.available & ~task.available
-        on = gone.nonzero()[0] if self.sets is None else self.sets.indices[gone[self.sets.indices]]
-        if len(on) and self.probability != 0.0:
+        on = self.sets.indices[gone[self.sets.indices]]
+        if len(on):
             raise UserError(f"policy: sensor {on[0]} may be on; the world has none there")
         if task.budget is not None and (most := self.most_on) > task.budget:
             raise UserError(f"policy: up to {most} sensors on in a step; expected {task.budget}")
@@ -270,11 +232,7 @@ class PolicyTable(Carded, SetTable):
     @property
     def most_on(self) -> int:
         """Sensors that may be on in one step."""
-        if self.k is not None:
-            return self.k
-        if self.sets is None:
-            return self.task.total_sensors if self.probability else 0
-        return int(np.diff(self.sets.indptr).max(initial=0))
+        return int(np.diff(self.sets.indptr).max(initial=0)) if self.k is None else self.k
 
     def dense(self) -> BoolArray:
         """`[keys, t_max + 1, S]`, the sets of a deterministic policy, a byte each, so for small worlds alone.
@@ -285,16 +243,13 @@ class PolicyTable(Carded, SetTable):
         if not self.deterministic:
             raise UserError("policy: draws its sets at random, so that there is no table of them")
         shape = (self.task.num_keys, self.task.num_choices, self.task.total_sensors)
-        if self.sets is None:
-            return np.full(shape, self.probability == 1.0)
-        return self.sets.toarray().reshape(shape)
+        return self.written.toarray().reshape(shape)
 
     @cached_property
     def written(self) -> sparse.csr_array:
-        """`[keys * (t_max + 1), S]` sets of a deterministic policy, also where one probability stands for all."""
-        if self.sets is not None:
-            return self.sets
-        return sparse.csr_array(self.dense().reshape(-1, self.task.total_sensors))
+        """`[keys * (t_max + 1), S]` sets, also where one row stands for all."""
+        rows = self.task.num_keys * self.task.num_choices
+        return self.sets[np.zeros(rows, dtype=np.int64)] if self.alike else self.sets
 
     def as_lists(self) -> dict[str, Any]:
         """Plain lists, as `sets.json` has them: rows and columns, t_max, and each key's sensors on at n = 0 ... t_max.
@@ -320,20 +275,15 @@ class PolicyTable(Carded, SetTable):
 
     def sensors(self, key: int, misses: int) -> list[int]:
         """The sensors with a probability above 0, n misses after the detection that left `key`."""
-        if self.sets is None:
-            return list(range(self.task.total_sensors)) if self.probability else []
         return self.sets.indices[self._entries_of(key, misses)].tolist()
 
     def chances(self, key: int, misses: int) -> Array:
         """The probabilities of `sensors`."""
-        if self.sets is None:
-            return np.full(len(self.sensors(key, misses)), self.probability, dtype=np.float64)
         return self.sets.data[self._entries_of(key, misses)].astype(np.float64)
 
     def _entries_of(self, key: int, misses: int) -> slice:
         """The entries of a row of `sets`."""
-        assert self.sets is not None
-        row = key * self.task.num_choices + misses
+        row = 0 if self.alike else key * self.task.num_choices + misses
         return slice(*self.sets.indptr[row : row + 2])
 
 
@@ -349,7 +299,7 @@ def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
         UserError: another shape, or entries that are no probabilities.
     """
     expected = (task.num_keys * task.num_choices, task.total_sensors)
-    if sets.shape != expected:
+    if sets.shape not in (expected, (1, task.total_sensors)):
         raise UserError(
             f"policy: expected sets of shape {expected} (keys (t_max + 1), sensors), got {sets.shape}"
         )
@@ -361,6 +311,8 @@ def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
         sets = sets.astype(np.bool_ if np.isin(sets.data, (0, 1)).all() else np.float64)
     sets.sum_duplicates()  # sorts the columns of each row as well
     sets.eliminate_zeros()
+    if sets.shape != expected and task.window is not None and sets.nnz:
+        sets = sets[np.zeros(expected[0], dtype=np.int64)]  # each cell has a window of its own
     _check_choosable(task, sets)
     return sets
 
@@ -382,15 +334,10 @@ def _check_choosable(task: Task, sets: sparse.csr_array) -> None:
             raise UserError(f"policy: sensor {sensor} cannot be chosen from cell {x}, {why}")
 
 
-def _choosable_sets(task: Task, probability: float) -> sparse.csr_array:
-    """`[keys (t_max + 1), S]`, every sensor that can be chosen from each located cell, with one probability."""
-    if task.window is None:
-        near = sparse.csr_array(np.tile(task.available, (task.num_cells, 1)))
-    elif task.coverage is None:
-        near = window_cells(task.size, task.window)
-    else:
-        near = task.sensors_near
-    near = sparse.csr_array(near.multiply(task.available) * probability)
-    near.eliminate_zeros()
-    near = short_indices(sparse.csr_array(near, dtype=np.float64 if probability < 1 else np.bool_))
+def _choosable_sets(task: Task, probability: float | None) -> sparse.csr_array:
+    """Every sensor that can be chosen from each located cell, with one probability; without a window, one row."""
+    if task.window is None or not probability:
+        return sparse.csr_array([task.available * (probability or 0.0)])
+    near = window_cells(task.size, task.window) if task.coverage is None else task.sensors_near
+    near = short_indices(sparse.csr_array(near.multiply(task.available) * probability))
     return near[np.repeat(np.arange(task.num_cells), task.keys.num_classes * task.num_choices)]

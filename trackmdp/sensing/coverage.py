@@ -139,7 +139,7 @@ def _each_log(sets: sparse.csr_array, sees: sparse.csr_array) -> sparse.csr_arra
 
 
 def _of_subsets(sets: sparse.csr_array, sees: sparse.csr_array, k: int) -> sparse.csr_array:
-    """See `reported`: `shared_out` for all rows with the same number of sensors at a time."""
+    """See `reported`: `_shared_out` for all rows with the same number of sensors at a time."""
     each, cells = sees[sets.indices], sees.shape[1]
     code = row_index(sets)[row_index(each)].astype(np.int64) * cells + each.indices
     # A row for each pair of a row of `sets` and a cell, with the sensors that cover it.
@@ -150,18 +150,15 @@ def _of_subsets(sets: sparse.csr_array, sees: sparse.csr_array, k: int) -> spars
     count, found = np.diff(sets.indptr)[pairs // cells], np.zeros(len(pairs))
     for sensors in np.unique(count).tolist():
         here = count == sensors
-        found[here] = shared_out(covering[here], 0.0, min(k, sensors), sensors)
+        found[here] = _shared_out(covering[here], min(k, sensors), sensors)
     return sparse.csr_array((found, np.divmod(pairs, cells)), shape=(sets.shape[0], cells))
 
 
-def shared_out(
-    sees_by_cell: sparse.csr_array, probability: float, k: int | None, sensors: int
-) -> npt.NDArray[np.float64]:
-    """`[M]` probability of a report from each cell, where every sensor is on with `probability`, or k of all are.
+def _shared_out(sees_by_cell: sparse.csr_array, k: int, sensors: int) -> npt.NDArray[np.float64]:
+    """`[M]` probability of a report from each cell, where k of all sensors are on.
 
     Args:
         sees_by_cell: `[M, S]`, probabilities that a sensor that is on reports a target.
-        probability: of each sensor, independently; not read with `k`.
         k: exactly so many sensors are on, each such subset as likely.
         sensors: the existing ones.
     """
@@ -170,8 +167,6 @@ def shared_out(
     filled = np.arange(shape[1]) < degree[:, None]
     p = np.zeros(shape)
     p[filled] = sees_by_cell.data
-    if k is None:
-        return np.asarray(1.0 - np.prod(1.0 - probability * p, axis=1))
     # i of the d sensors of a cell are on with C(S - d, k - i) / C(S, k) for each such subset; all of it stay silent
     # with the sum over these subsets of Π (1 - p), the elementary symmetric polynomial e_i of 1 - p.
     silent = np.zeros((shape[0], shape[1] + 1))

@@ -181,11 +181,9 @@ def _regions(world: World, policy: PolicyTable, value: Array, side: int) -> Made
     def region(number: int) -> _Region:
         block = parts[number]
         cells, here = cells_of(block.seen, world.columns), sub_world(world, block.seen)
-        if policy.sets is None:
-            mine = PolicyTable(here, probability=policy.probability)
-        else:
-            states = (cells[:, None] * world.num_choices + np.arange(world.num_choices)).ravel()
-            mine = PolicyTable(here, within(policy.sets[states], world, block.seen))
+        states = (cells[:, None] * world.num_choices + np.arange(world.num_choices)).ravel()
+        rows = policy.sets if policy.alike else policy.sets[states]
+        mine = PolicyTable(here, within(rows, world, block.seen))
         return _Region(here, cells, block.mine, mine, *(each[cells] for each in worth))
 
     return Made(len(parts), region)

@@ -77,8 +77,7 @@ class KeyPlans:
     @classmethod
     def of_table(cls, policy: PolicyTable, keys: IndexArray) -> KeyPlans:
         """A policy with sets, `keys` apart."""
-        task, sets = policy.task, policy.sets
-        assert sets is not None
+        task, sets = policy.task, policy.written
 
         def rows(keys: IndexArray) -> sparse.csr_array:
             return sets[block_rows(keys, task.num_choices)]
@@ -88,7 +87,6 @@ class KeyPlans:
     def on(self, keys: IndexArray) -> KeyPlans:
         """The same policy with plans of other `keys`, in their order."""
         task, (place, known) = self.table.task, among(self.keys, keys)
-        assert self.table.sets is not None
         own = self.table.sets[block_rows(place[known], task.num_choices)]
         both = sparse.vstack([own, self.others(keys[~known])], format="csr")
         # Rows of the known keys, then those of the others, are brought into the order of `keys`.
