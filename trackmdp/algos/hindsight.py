@@ -103,6 +103,7 @@ class Hindsight(Checkpointed):
             0, -(-(self.updates - alongside) // cfg.updates_per_iteration)
         )
         self._generator, self._seed = generator(seed, "hindsight", device=device), seed
+        self._loss = self._actor_loss()
         # Whether another policy is better is judged on recordings that nothing was learned from.
         judges = cfg.exchange and not self._mixed
         self._buffer = _buffer(task, cfg.buffer_size, self._generator, seed if judges else None)
@@ -212,7 +213,7 @@ class Hindsight(Checkpointed):
     def _make_learner(self, reach: int) -> _Learner:
         loss = HindsightLoss(
             self.task,
-            self._actor_loss(),
+            self._loss,
             reach=reach,
             hidden=self.hidden,
             discount=self.cfg.gamma,

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from trackmdp.algos.actor_loss import ActorLoss, Poisson, PolicyGradient, Surrogate
 from trackmdp.algos.hindsight import Hindsight
 from trackmdp.config.credit import A2cPerSensorConfig, PpoPerSensorConfig
 from trackmdp.errors import UserError
-from trackmdp.sensing.task import Task
 
 
 class PerSensorA2C(Hindsight):
@@ -25,18 +22,15 @@ class PerSensorPPO(Hindsight):
 
     cfg: PpoPerSensorConfig
 
-    def __init__(self, task: Task, cfg: PpoPerSensorConfig, **run: Any) -> None:
+    def _actor_loss(self) -> ActorLoss:
+        cfg, task = self.cfg, self.task
+        # Without a generator the surrogate takes its expectation over the old policy's sets.
+        rng = self._generator if cfg.surrogate == "sampled" else None
         # It counts paths, which have weights where sensors miss, and each of which one sensor sees.
-        if cfg.surrogate == "sampled" and not (task.perfect and task.coverage is None):
+        if rng is not None and not (task.perfect and task.coverage is None):
             raise UserError(
                 "algo.surrogate=sampled: expected all_action where sensors miss or have footprints"
             )
-        super().__init__(task, cfg, **run)
-
-    def _actor_loss(self) -> ActorLoss:
-        cfg = self.cfg
-        # Without a generator the surrogate takes its expectation over the old policy's sets.
-        rng = self._generator if cfg.surrogate == "sampled" else None
         return Surrogate(
             cfg.entropy, clip_epsilon=cfg.clip_epsilon, minibatches=cfg.minibatches, generator=rng
         )

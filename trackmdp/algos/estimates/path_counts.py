@@ -142,6 +142,7 @@ class _View:
     Attributes:
         paths: the events.
         width: displacements in view.
+        least: gain up to which no sensor pays.
         local: for each n `[E]` displacement of each entry, `width` out of view.
         cell: for each n `[E]` cell of each entry.
         plan: for each n `[E]` place of the key of each entry.
@@ -163,11 +164,20 @@ class _View:
         self.radius = min(max(1, radius), rows + columns, paths.task.window or 2**31)
         side = 2 * self.radius + 1
         self.width = side**2
+        # With footprints many cells pay for one sensor.
+        alone = paths.task.coverage is None
+        self.least = float(paths.task.prices.min()) if alone else 0.0
         self.local = []
         for pair, away in zip(ends, far, strict=True):
             down, across = displacement(columns, *pair)
             number = (down + self.radius) * side + across + self.radius
             self.local.append(np.where(away <= self.radius, number, self.width))
+
+    def reports(self, n: int, sets: sparse.csr_array) -> Array:
+        """`[E]`, probability of a report at n by the sets `[K, S]` of the keys seen."""
+        alone = Task(**self.paths.task.given | {"t_max": 0})  # one free choice: one set a key
+        table = SetTable(alone, sets, len(self.paths.keys))
+        return table.reports(0, self.plan[n], self.cell[n])
 
     def put_down(self, start: IndexArray, local: IndexArray) -> tuple[IndexArray, BoolArray]:
         """Cells of displacements `local` from cells `start`, and whether they are in the grid."""
@@ -178,7 +188,7 @@ class _View:
     def sets(self, keys: IndexArray, gains: Array, wanted: IndexArray) -> sparse.csr_array:
         """`[Q, S]` bool, the best sets after `keys` `[Q]`, of `gains` `[Q, W]` at displacements `wanted` `[W]`."""
         task = self.paths.task
-        row, place = np.nonzero(gains > 0)
+        row, place = np.nonzero(gains > self.least)
         located = task.keys.cell(keys)
         cell, inside = self.put_down(located[row], wanted[place])
         row, cell, gain = row[inside], cell[inside], gains[row, place][inside]
@@ -195,30 +205,32 @@ class _Counted:
         self._view, self._prior = view, prior
         task, renewal = view.paths.task, view.paths.renewal
         *shared, _ = task.keys.contexts(renewal.plans)
-        # Every level follows sets of its own: its counts at n are of targets that its own sets have missed so far.
-        alive = [weight[: renewal.count] for _ in range(len(shared) + 1)]
+        count = len(renewal.plans)
+        # Every level follows sets of its own, the keys the last ones: its counts at n are of targets that its own sets
+        # have missed so far. On a path each event has one entry at most.
+        contexts = [*shared, (np.arange(count), count)]
+        alive = [weight[: renewal.count] for _ in contexts]
         self._shared: list[_Shared] = []
         sets: list[sparse.csr_array] = []
         above = self._above()
         for n, (step, gain) in enumerate(zip(renewal.steps, gains, strict=False)):
             mean = np.zeros((1, view.width))
-            for level, (context, count) in enumerate(shared):
+            for level, (context, number) in enumerate(contexts):
                 mass = alive[level][step.rows]
-                own, arrived = self._sums(n, context, count, gain, mass)
-                strength = 0.0 if level == 0 else prior
-                mean = _mean(own.toarray(), arrived, strength, mean[above[level]])
-                report = self._reports(n, context, mean)
-                alive[level] = _left(renewal.count, step.rows, mass * (1.0 - report))
-            mass = alive[-1][step.rows]
-            own, arrived = self._sums(
-                n, np.arange(len(renewal.plans)), len(renewal.plans), gain, mass
-            )
-            self._shared.append(_Shared.of(view, mean, own, arrived, prior))
-            sets.append(self._sets_of_seen(own, arrived))
-            table = SetTable(_one_set(task), sets[-1], len(renewal.plans))
-            report = table.reports(0, view.plan[n], view.cell[n])
-            alive[-1] = _left(renewal.count, step.rows, mass * (1.0 - report))
-        self.table = SetTable(task, interleaved(sets), len(renewal.plans))
+                own, arrived = self._sums(n, context, number, gain, mass)
+                if level < len(shared):
+                    # As many arrivals more of the level above; the first level has none above it.
+                    more = prior * (level > 0)
+                    total = np.maximum(arrived + more, 1e-12)
+                    mean = (own.toarray() + more * mean[above[level]]) / total[:, None]
+                    report = self._reports(n, context, mean)
+                else:
+                    self._shared.append(_Shared.of(view, mean, own, arrived, prior))
+                    sets.append(self._sets_of_seen(own, arrived))
+                    report = view.reports(n, sets[-1])
+                alive[level] = np.zeros(renewal.count)
+                alive[level][step.rows] = mass * (1.0 - report)
+        self.table = SetTable(task, interleaved(sets), count)
 
     def _reports(self, n: int, context: IndexArray, mean: Array) -> Array:
         """`[E]`, probability of a report by the sets of a level with mean gains `mean` `[C, W]`."""
@@ -228,9 +240,7 @@ class _Counted:
             chance = task.detects(view.cell[n])
             gain = padded[context[view.plan[n]], view.local[n]]
             return np.where(gain * chance > task.prices[view.cell[n]], chance, 0.0)
-        plans = view.paths.keys
-        sets = view.sets(plans, mean[context], np.arange(view.width))
-        return SetTable(_one_set(task), sets, len(plans)).reports(0, view.plan[n], view.cell[n])
+        return view.reports(n, view.sets(view.paths.keys, mean[context], np.arange(view.width)))
 
     def _above(self) -> list[IndexArray]:
         """For each shared level, the context above each of its contexts."""
@@ -257,18 +267,17 @@ class _Counted:
     def _sets_of_seen(self, own: sparse.csr_array, arrived: Array) -> sparse.csr_array:
         """`[K, S]` bool, the sets of the keys seen by their gains and arrivals and their prior means."""
         view, prior, known = self._view, self._prior, self._shared[-1]
-        least = float(view.paths.task.prices.min()) if view.paths.task.coverage is None else 0.0
         keys, parts = view.paths.keys, []
         # Most displacements are worth no sensor after any key at all.
         share = sparse.diags_array(1.0 / np.maximum(arrived + prior, 1e-12)) @ own
         most = share.max(axis=0).toarray().ravel() + known.most.max(0)
-        wanted = np.flatnonzero(most > least)
+        wanted = np.flatnonzero(most > view.least)
         for begin in range(0, len(keys), _KEYS_AT_ONCE):
             each = slice(begin, begin + _KEYS_AT_ONCE)
             weight = prior / np.maximum(arrived[each] + prior, 1e-12)
             value = share[each][:, wanted].toarray()
             value = value + weight[:, None] * known.after(keys[each], wanted)
-            parts.append(view.sets(keys[each], np.where(value > least, value, 0.0), wanted))
+            parts.append(view.sets(keys[each], value, wanted))
         return sparse.vstack(parts, format="csr")
 
     def plans(self) -> KeyPlans:
@@ -284,33 +293,20 @@ class _Counted:
         view, task = self._view, self._view.paths.task
         classes = task.keys.num_classes
         known = keys % classes
-        least = float(task.prices.min()) if task.coverage is None else 0.0
         # Keys of one class at a time: few displacements are worth a sensor after it, from any cell.
         order = np.argsort(known.astype(np.min_scalar_type(classes)), kind="stable")
         ends = np.cumsum(np.bincount(known, minlength=classes))
         rows, columns = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
         for at, most in zip(np.split(order, ends[:-1]), shared.most, strict=True):
-            wanted = np.flatnonzero(most > least)
+            wanted = np.flatnonzero(most > view.least)
             if not (len(at) and len(wanted)):
                 continue
             value = shared.after(keys[at], wanted)
-            on = view.sets(keys[at], np.where(value > least, value, 0.0), wanted).tocoo()
+            on = view.sets(keys[at], value, wanted).tocoo()
             rows.append(at[on.row])
             columns.append(on.col)
         shape = (len(keys), task.total_sensors)
         return ones_at(np.concatenate(rows), np.concatenate(columns), shape)
-
-
-def _one_set(task: Task) -> Task:
-    """The task with one free choice, for tables of one set a key."""
-    return Task(**task.given | {"t_max": 0})
-
-
-def _left(count: int, rows: IndexArray, mass: Array) -> Array:
-    """`[B]`, the undetected mass of each event: on a path each has one entry at most."""
-    left = np.zeros(count)
-    left[rows] = mass
-    return left
 
 
 @dataclass(frozen=True)
@@ -377,12 +373,6 @@ class _Shared:
         row, known = np.divmod(pairs, classes)
         gains = self.common[known[:, None], local] * self.lift[row[:, None], local]
         return (gains * self.scale[row, known][:, None])[place]
-
-
-def _mean(gains: Array, arrived: Array, strength: float, above: Array) -> Array:
-    """`[C, W]` gains per arrival, `strength` arrivals of the level above added."""
-    total = np.maximum(arrived + strength, 1e-12)
-    return (gains + strength * above) / total[:, None]
 
 
 def along(paths: Paths, plans: KeyPlans) -> AlongPaths:
