@@ -13,12 +13,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-from trackmdp.algos.estimates.last_moves import (
-    displacements,
-    heading_after,
-    headings,
-    shift,
-)
 from trackmdp.arrays.entries import among
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.grid.displacements import cell_at
@@ -34,9 +28,6 @@ _WEIGHT = 3.0
 """Moves as many as which those from a cell, after any move, count among those after the last one."""
 _AT_ONCE = 2**21
 """Unknown cells times displacements worked on at once: some 20 MB an array."""
-
-_MOST_CODES = 2**20
-"""Codes up to which counts are a table of all of them: a look-up takes a tenth of the time of a search."""
 
 Missed: TypeAlias = Callable[[IndexArray, IndexArray], Array]
 """From numbers of unknown cells `[K]` and cells `[K, H]` to the probability of a miss there, `[K, H]`."""
@@ -81,12 +72,13 @@ class _Moves:
     Attributes:
         task: its grid.
         moves: `[H]`, the `displacements`.
-        counts: how often a cell (b), with its `headings` (m) and with the next cell (c), came before a next cell.
+        counts: how often a cell (b), with its `headings` (m) and with the next cell (c), came before a next cell: the
+            codes that came, in order, and their numbers.
     """
 
     task: Task
     moves: IndexArray
-    counts: Mapping[str, _Counts]
+    counts: Mapping[str, tuple[IndexArray, IndexArray]]
 
     @classmethod
     def of(cls, task: Task, line: Tracks, unknown: BoolArray) -> _Moves:
@@ -101,7 +93,7 @@ class _Moves:
         possible = (after == task.num_cells) | np.isin(shift(task, before, after), moves)
         at, before, after = at[possible], before[possible], after[possible]
         codes = _codes(task, moves, before, headings(task, line, moves)[at], after)
-        counts = {name: _Counts.of(each) for name, each in codes.items()}
+        counts = {name: np.unique(each, return_counts=True) for name, each in codes.items()}
         return cls(task, moves, counts)
 
     def candidates(self, last: IndexArray) -> tuple[IndexArray, BoolArray]:
@@ -135,7 +127,11 @@ class _Moves:
     def _chance(self, cell: IndexArray, mode: IndexArray, after: IndexArray) -> Array:
         """Probability of the next cell."""
         codes = _codes(self.task, self.moves, cell, mode, after)
-        count = {name: self.counts[name].looked_up(each) for name, each in codes.items()}
+        count = {}
+        for name, wanted in codes.items():
+            came, times = self.counts[name]
+            place, known = among(came, wanted)
+            count[name] = np.where(known, times[place], 0)
         alone: Array = count["bc"] / np.maximum(count["b"], 1.0)
         return (count["bmc"] + _WEIGHT * alone) / (count["bm"] + _WEIGHT) + _LEAP
 
@@ -148,28 +144,33 @@ def _codes(
     return {"b": cell, "bc": cell * wide + after, "bm": known, "bmc": known * wide + after}
 
 
-@dataclass(frozen=True)
-class _Counts:
-    """How often codes came.
+def displacements(task: Task, before: IndexArray, after: IndexArray) -> IndexArray:
+    """`[H]`, the moves seen, each as one number (`shift`), in increasing order; 0 for a stop is always one."""
+    inside = after < task.num_cells
+    return np.unique(np.append(shift(task, before[inside], after[inside]), 0))
 
-    Attributes:
-        codes: those that came, in increasing order; None: all from 0, and one more, which stands for larger ones.
-        times: of each.
-    """
 
-    codes: IndexArray | None
-    times: IndexArray
+def headings(task: Task, line: Tracks, moves: IndexArray) -> IndexArray:
+    """`[P]` modes at the points of closed tracks: twice the place in `moves`, 1 more after a stop."""
+    cells, place = line.cells, np.arange(len(line.cells))
+    number = np.zeros(len(cells), dtype=np.int64)
+    number[1:] = shift(task, cells[:-1], cells[1:])
+    number[line.first[:-1]] = 0
+    begin = np.repeat(line.first[:-1], line.lengths)
+    moved = np.maximum.accumulate(np.where((number != 0) | (place == begin), place, 0))
+    return 2 * np.searchsorted(moves, number[moved]) + (moved < place)
 
-    @classmethod
-    def of(cls, codes: IndexArray) -> _Counts:
-        """The counts of `codes`, none of them below 0."""
-        if codes.max(initial=0) < _MOST_CODES:
-            return cls(None, np.append(np.bincount(codes), 0))
-        return cls(*np.unique(codes, return_counts=True))
 
-    def looked_up(self, wanted: IndexArray) -> IndexArray:
-        """How often the `wanted` codes came."""
-        if self.codes is None:
-            return np.asarray(self.times[np.minimum(wanted, len(self.times) - 1)])
-        place, known = among(self.codes, wanted)
-        return np.where(known, self.times[place], 0)
+def heading_after(
+    task: Task, moves: IndexArray, mode: IndexArray, before: IndexArray, after: IndexArray
+) -> IndexArray:
+    """The modes after moves from cells `before` to cells `after`, see `headings`."""
+    number = shift(task, before, after)
+    return np.where(number == 0, mode // 2 * 2 + 1, 2 * np.searchsorted(moves, number))
+
+
+def shift(task: Task, before: IndexArray, after: IndexArray) -> IndexArray:
+    """One number for each pair of rows and columns moved, on C columns down · (2 C + 1) + across."""
+    # Cell x in row i and column j is at i (2 C + 1) + j = x + i (C + 1): remainders would take twice as long again.
+    down = after // task.columns - before // task.columns
+    return after - before + down * (task.columns + 1)

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 import trackmdp as tm
 from tests.tracks import by_hand
-from trackmdp.algos.estimates import hidden_cells
-from trackmdp.algos.estimates.last_moves import (
+from trackmdp.algos.estimates.hidden_cells import (
     displacements,
     heading_after,
     headings,
@@ -33,20 +29,6 @@ def test_a_stop_keeps_the_last_move_and_is_known() -> None:
     assert heading_after(
         TASK, moves, np.array([2, 2]), np.array([1, 1]), np.array([1, 2])
     ).tolist() == [3, 2]
-
-
-@given(
-    st.lists(st.integers(0, 30), min_size=1),
-    st.lists(st.integers(0, 40), min_size=1),
-    st.booleans(),
-)
-def test_codes_are_counted(seen: list[int], wanted: list[int], many: bool) -> None:
-    """In a table of all codes, or where these are too many by a search."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(hidden_cells, "_MOST_CODES", 0 if many else 31)
-        counts = hidden_cells._Counts.of(np.array(seen))
-    assert (counts.codes is not None) == many
-    assert counts.looked_up(np.array(wanted)).tolist() == [seen.count(each) for each in wanted]
 
 
 def test_a_shift_has_a_number() -> None:
