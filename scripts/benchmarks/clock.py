@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import subprocess
@@ -120,15 +119,6 @@ def beside_checkout(place: str, typed: Sequence[str], key: str, repeat: int) -> 
                 subprocess.run(program, check=True, stdout=subprocess.DEVNULL, env=own)
                 figures.append(json.loads(out.read_text())["rows"][0][key])
     return min(found[HERE]), min(found[place])
-
-
-def timed_training(*words: str) -> tuple[list[dict[str, str]], Usage]:
-    """The evaluated rows of `metrics.csv` of `trackmdp train words...` in a process of its own, and its usage."""
-    with tempfile.TemporaryDirectory() as folder:
-        usage = measured("train", *words, "quiet=true", f"hydra.run.dir={folder}/run")
-        with Path(folder, "run", "metrics.csv").open() as stream:
-            # Rows between two evaluations have no AIHTR.
-            return [row for row in csv.DictReader(stream) if row["aihtr"]], usage
 
 
 @contextmanager

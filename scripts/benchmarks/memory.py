@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import tempfile
 from collections.abc import Iterator, Mapping
 
-from benchmarks.clock import timed_training
+from benchmarks.clock import measured
 from benchmarks.words import Row, as_words, world_of
 from trackmdp.config.compose import compose
 from trackmdp.training.devices import needs
@@ -30,6 +31,8 @@ def rows(
         task = world_of(world)
         estimate = sum(needs(compose("train", own | {"grid.size": size}), task).values())
         typed = [*as_words(world), *(f"{key}={value}" for key, value in own.items())]
-        _, usage = timed_training(*typed, f"threads={threads}", f"device={device}")
+        typed += [f"threads={threads}", f"device={device}", "quiet=true"]
+        with tempfile.TemporaryDirectory() as folder:
+            usage = measured("train", *typed, f"hydra.run.dir={folder}/run")
         expected = estimate / 2**20
         yield {"algo": algo, "N": size, "expected_mib": expected, "peak_mib": usage.peak_mib}
