@@ -126,19 +126,6 @@ class Walks:
         return found
 
 
-class Members(Targets):
-    """Targets of all groups in a row, `[B K]`, each in a cell of its own motion at the start."""
-
-    def __init__(self, paths: GroupPaths, count: int) -> None:
-        super().__init__(paths.sampler)
-        self._cells, self._offset = paths.cells, paths.offset.repeat(count)
-
-    def _start(self, rows: Tensor) -> Tensor:
-        rng = self.generators["start"]
-        cell = torch.randint(self._cells, rows.shape, generator=rng, device=self.device)
-        return cell + self._offset
-
-
 class TrackMembers(RecordedTargets):
     """Targets of all groups in a row, `[B K]`: each start is that of one, whom others join that overlap with it."""
 
@@ -159,5 +146,7 @@ class TrackMembers(RecordedTargets):
 
 
 def group_members(paths: GroupPaths, count: int) -> Targets:
-    """The targets of `count` groups that follow `paths`."""
-    return Members(paths, count) if paths.together is None else TrackMembers(paths, paths.together)
+    """The targets of `count` groups that follow `paths`, each at the start in a cell of its own motion."""
+    if paths.together is not None:
+        return TrackMembers(paths, paths.together)
+    return Targets(paths.sampler, paths.cells, paths.offset.repeat(count))

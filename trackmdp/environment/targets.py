@@ -13,28 +13,34 @@ from trackmdp.world.problem import Problem
 
 
 class Targets(Streams):
-    """Draws for a batch of targets, which start in any of the sampler's starts with equal probability.
+    """Draws for a batch of targets, which start in any of the sampler's starts with equal probability, or in any of M.
 
     Places of targets are part of the environment's state; this object holds only the generators.
 
     Args:
         sampler: samples the paths.
+        cells: M; None: all starts of the sampler.
+        first: `[B]`, of these M states the first one for each target; None: 0.
 
     Attributes:
         draw: `[B]` int64 draws for the next move of the targets of a mask `[B]`.
         start: `[B]` places of new targets; those of the mask `[B]` are used.
     """
 
-    def __init__(self, sampler: PathSampler) -> None:
+    def __init__(
+        self, sampler: PathSampler, cells: int | None = None, first: Tensor | None = None
+    ) -> None:
         super().__init__(sampler.device, "motion", "start")
-        self.sampler = sampler
+        self.sampler, self._first = sampler, first
+        self._starts = sampler.starts if cells is None else cells
         self.start = Draw(self._start, torch.int64, sampler.device)
         self.draw = Draw(self._draw, torch.int64, sampler.device)
 
     def _start(self, rows: Tensor) -> Tensor:
         # For all rows, so that the start of a row does not depend on the others.
         rng = self.generators["start"]
-        return torch.randint(self.sampler.starts, rows.shape, generator=rng, device=self.device)
+        start = torch.randint(self._starts, rows.shape, generator=rng, device=self.device)
+        return start if self._first is None else start + self._first
 
     def _draw(self, rows: Tensor) -> Tensor:
         return self.sampler.draw(len(rows), self.generators["motion"])
