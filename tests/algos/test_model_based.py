@@ -328,6 +328,8 @@ def test_the_first_line_names_the_estimate(here: Path, capsys: pytest.CaptureFix
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
+        (["algo=path_counts"], "algo=path_counts: renamed, expected algo=model_based"),
+        (["algo=learned_kernel"], "algo=learned_kernel: renamed, expected algo=model_based"),
         (["algo.warm_up=1"], "algo.warm_up=1: without effect with algo.sensing=null"),
         (["algo.sensing=all", "cost.budget=1"], "expected chosen or null with cost.budget=1"),
         (["algo.warm_up=1", "cost.budget=1"], "algo.warm_up=1: without effect with cost.budget"),

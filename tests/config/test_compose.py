@@ -60,7 +60,12 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"kernel": "table"}, "kernel.path: missing, expected a path"),
     ({"kernel": "given"}, "kernel.reveals: missing, expected a problem made in Python"),
     ({"sensor": "given"}, "sensor.wide: missing, expected a problem made in Python"),
-    ({"lr": 0.5}, "lr: unknown option, did you mean algo.learning_rate?"),
+    (
+        {"algo": "a2c", "algo.credit": "per_sensor"},
+        "algo.credit: renamed, expected algo=a2c_per_sensor",
+    ),
+    ({"kernel.homogeneous": True}, "kernel.homogeneous: renamed, expected algo.share_cells"),
+    ({"lr": 0.5}, "lr: renamed, expected algo.learning_rate"),
     (
         {"log": "mcap", "log.layout": True},
         "log.layout: unknown option, did you mean log.mcap.layout?",
@@ -82,7 +87,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"kernel.support_size": 1, "kernel.low_probability": 0.2},
         "kernel.low_probability=0.2: without effect with support_size=1",
     ),
-    ({"algo.lr": 0.5}, "algo.lr: unknown option, did you mean algo.learning_rate?"),
+    ({"algo.lr": 0.5}, "algo.lr: renamed, expected algo.learning_rate"),
 ]
 
 

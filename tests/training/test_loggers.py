@@ -130,7 +130,7 @@ def test_an_option_of_a_logger_that_the_run_does_not_have(tmp_path: Path) -> Non
             "log=null: expected one of csv, tensorboard, wandb, mlflow, mcap, or log=[] for none",
         ),
         ("log=csv,mcap", "log=csv,mcap: expected log=[csv,mcap]"),
-        ("log.every=2", "log.every: unknown option, did you mean log.csv.every?"),
+        ("log.every=2", "log.every: renamed, expected log.csv.every"),
         (
             "log=[csv,mcap] log.mcap.episodes=0",
             "log.mcap.episodes=0: expected an integer from 1 to 1e6 (episodes)",

@@ -19,13 +19,22 @@ from trackmdp.errors import UserError
 
 _T = TypeVar("_T")
 
-_USUAL: dict[str, str] = {
+RENAMED: dict[str, str] = {
+    "algo.average": "algo.ema_decay",
+    "algo.credit": "algo=a2c_per_sensor",
     "algo.lam": "algo.gae_lambda",
     "algo.lr": "algo.learning_rate",
+    "algo=learned_kernel": "algo=model_based",
+    "algo=path_counts": "algo=model_based",
+    "credit": "algo=a2c_per_sensor",
+    "kernel.cell": "grid.cell",
+    "kernel.crs": "grid.crs",
+    "kernel.homogeneous": "algo.share_cells",
+    "kernel.origin": "grid.origin",
     "log.every": "log.csv.every",
     "lr": "algo.learning_rate",
 }
-"""Usual name of an option in other programs -> its name here."""
+"""Former or usual name of an option, or of a choice -> its name."""
 
 _VALUES = {"cost": "cost.sensor", "sensor": "sensor=miss sensor.p_d"}
 """Group -> words that end in the option that is meant where the group is given a number."""
@@ -41,8 +50,8 @@ def suggestion(name: str, known: Iterable[str], listed: Iterable[str] | None = N
 
 def unknown_option(key: str, known: Mapping[str, Option]) -> UserError:
     """The refusal of a dotted key that does not exist, with the names beside it."""
-    if key in _USUAL:
-        return UserError(f"{key}: unknown option, did you mean {_USUAL[key]}?")
+    if key in RENAMED:
+        return UserError(f"{key}: renamed, expected {RENAMED[key]}")
     # `algo.epochs` without algo=ppo is no misspelling, and no more is `log.mcap.episodes` without log=[mcap].
     group, _, name = key.partition(".")
     choice, _, own = name.partition(".")
@@ -87,6 +96,8 @@ def check_choice(group: str, name: Any) -> None:
     """
     if isinstance(name, str) and name in GROUPS[group]:
         return
+    if (former := f"{group}={name}") in RENAMED:
+        raise UserError(f"{former}: renamed, expected {RENAMED[former]}")
     if group in _VALUES and name is not None and is_number(str(name)):
         raise UserError(f"{group}={name}: expected {_VALUES[group]}={name}")
     none = ", or log=[] for none" if group == "log" and name is None else ""
