@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from tests.helpers import BORDERS
-from trackmdp.arrays.rows import pairwise_row_sums
+from trackmdp.arrays.entries import row_sums
 from trackmdp.errors import UserError
 from trackmdp.motion.kernels import load_table, random_support, random_walk
 from trackmdp.world.model import World
@@ -31,7 +31,7 @@ def test_row_sums_are_those_of_the_dense_matrix_to_the_bit(
 ) -> None:
     rng = np.random.default_rng(seed)
     dense = rng.random((20, columns)) * (rng.random((20, columns)) < density)
-    assert np.array_equal(pairwise_row_sums(sparse.csr_array(dense)), dense.sum(axis=1))
+    assert np.array_equal(row_sums(sparse.csr_array(dense)), dense.sum(axis=1))
 
 
 @given(SIDES, SIDES, st.sampled_from(BORDERS), st.booleans(), st.floats(0.01, 0.99))

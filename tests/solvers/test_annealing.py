@@ -13,7 +13,7 @@ from trackmdp.solvers import annealing
 from trackmdp.solvers.annealing import anneal
 from trackmdp.solvers.exchange import exchanged
 from trackmdp.solvers.renewal import Renewal
-from trackmdp.solvers.search import Found, candidates_of, clocked_sets, follow_credit
+from trackmdp.solvers.search import Found, clocked_sets, follow_credit
 from trackmdp.world.make import make_world
 from trackmdp.world.model import World
 
@@ -48,7 +48,7 @@ def test_a_slope_is_the_derivative_of_what_is_reported(kind: str) -> None:
 def test_certain_chances_are_sets(kind: str) -> None:
     world = world_of(kind)
     renewal, rng = Renewal(world, world.motion), np.random.default_rng(1)
-    sets = [rng.random(len(choice.rows)) < 0.5 for choice in renewal.choices]
+    sets = [rng.random((len(choice.rows), 1)) < 0.5 for choice in renewal.choices]
     chances = [on.astype(np.float64) for on in sets]
     assert Found(renewal, chances).aihtr == pytest.approx(Found(renewal, sets).aihtr, abs=1e-9)
 
@@ -58,22 +58,22 @@ def test_an_advantage_is_what_a_chance_gains_a_visit(kind: str) -> None:
     """The AIHTR's derivative is the advantage times the visits with which the sensor is decided about."""
     world = world_of(kind)
     renewal, rng = Renewal(world, world.motion), np.random.default_rng(2)
-    chances = [rng.uniform(0.1, 0.9, len(choice.rows)) for choice in renewal.choices]
+    chances = [rng.uniform(0.1, 0.9, (len(choice.rows), 1)) for choice in renewal.choices]
     policy = Found(renewal, chances)
     assert policy.visits is not None
     plans = renewal.problem(policy.value, policy.visits)
-    advantages, now = plans.advantages(candidates_of(chances), 0.0), plans.mass
+    advantages, now = plans.advantages(chances, 0.0), plans.mass
     for t, (turn, chance) in enumerate(zip(plans.turns, chances, strict=True), start=1):
         now = turn.back @ now
-        come = (plans.layout.sums(t) @ now)[turn.choice.rows, 0]
+        come = (plans.layout.sums[t] @ now)[turn.choice.rows, 0]
         place = int(np.argmax(come))
         rise = 0.0
         for sign in (1.0, -1.0):
             other = [each.copy() for each in chances]
             other[t - 1][place] += sign * 1e-5
             rise += sign * Found(renewal, other).aihtr / 2e-5
-        assert rise == pytest.approx(advantages[t - 1][place] * come[place], rel=1e-4, abs=1e-6)
-        now = plans.missing(t, chance[:, None], now)
+        assert rise == pytest.approx(advantages[t - 1][place, 0] * come[place], rel=1e-4, abs=1e-6)
+        now = plans.missing(t, chance, now)
 
 
 def test_optimism_weighs_the_credit_against_the_exact_gain() -> None:
@@ -88,7 +88,7 @@ def test_optimism_weighs_the_credit_against_the_exact_gain() -> None:
     for one, mean, other, turn in zip(exact, half, full, plans.turns, strict=True):
         np.testing.assert_allclose(mean, (one + other) / 2)
         # The gain falls to those of its row in the sensor's cell: all of them together make 1.
-        share = (other + turn.price) / (0.5 * 0.8)
+        share = (other[:, 0] + turn.price) / (0.5 * 0.8)
         total = np.bincount(turn.choice.rows, share)
         np.testing.assert_allclose(total[np.unique(turn.choice.rows)], 1.0)
 
@@ -96,10 +96,10 @@ def test_optimism_weighs_the_credit_against_the_exact_gain() -> None:
 def test_sensors_out_of_the_window_have_no_chance() -> None:
     world = headings(3, 0.8, cost=0.05, t_max=1, memory="displacement").but(window=1)
     renewal = Renewal(world, world.motion)
-    odds = [np.full(len(choice.rows), 2.0) for choice in renewal.choices]
+    odds = [np.full((len(choice.rows), 1), 2.0) for choice in renewal.choices]
     for choice, chance in zip(renewal.choices, annealing._chances(renewal, odds), strict=True):
         assert choice.allowed is not None
-        np.testing.assert_allclose(chance, np.where(choice.allowed[:, 0], 1 / (1 + np.exp(-2)), 0))
+        np.testing.assert_allclose(chance, np.where(choice.allowed, 1 / (1 + np.exp(-2)), 0))
     assert 0 < (chance == 0).sum() < len(chance)  # two moves may lead out of it
 
 
@@ -134,10 +134,10 @@ def test_limits_hold_for_annealed_policies(changes: dict[str, int]) -> None:
     for choice, on in zip(renewal.choices, policy.sets, strict=True):
         assert on.any()
         if "budget" in changes:
-            assert np.bincount(choice.rows[on]).max() == 1
+            assert np.bincount(choice.rows[on[:, 0]]).max() == 1
         else:
             assert choice.allowed is not None
-            assert not (on & ~choice.allowed[:, 0]).any()
+            assert not (on & ~choice.allowed).any()
 
 
 def test_temperatures_and_errors_are_in_rewards() -> None:

@@ -17,14 +17,14 @@ from trackmdp.solvers.certify.inner import InnerProblem
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.plans import Plans
 from trackmdp.solvers.renewal import Renewal
-from trackmdp.solvers.search import Found, candidates_of, columns_of
+from trackmdp.solvers.search import Found
 from trackmdp.world.make import make_world
 from trackmdp.world.model import World
 
 
 def ascended(problem: InnerProblem, sets: list[BoolArray]) -> list[BoolArray]:
     """Sets of which no single one can be changed for the better."""
-    return columns_of(problem.plans().ascend(candidates_of(sets), sweeps=9))
+    return problem.plans().ascend(sets, sweeps=9)
 
 
 @given(tiny_worlds(size=3, most_t_max=3, misses=True), st.integers(0, 2**32 - 1))
@@ -104,7 +104,7 @@ def test_one_or_two_cells_are_left_for_the_next_set(
     problem = four_ways()
     choices = problem.renewal.choices
     sets = [
-        np.isin(choice.sensors, cells) & (choice.rows == 0)
+        (np.isin(choice.sensors, cells) & (choice.rows == 0))[:, None]
         for choice, cells in zip(choices, (first, then), strict=True)
     ]
     stuck = [
@@ -160,7 +160,7 @@ def test_each_cell_takes_the_best_plan_of_all_starts(monkeypatch: pytest.MonkeyP
     good, none = renewal.sets(best), renewal.sets(PolicyTable.none(world))
     halves = [
         [
-            np.where((choice.rows < 8) == first, *on)
+            np.where(((choice.rows < 8) == first)[:, None], *on)
             for choice, *on in zip(renewal.choices, good, none, strict=True)
         ]
         for first in (True, False)

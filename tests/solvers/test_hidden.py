@@ -57,7 +57,7 @@ def test_the_bound_holds_for_every_memory_and_memory_pays() -> None:
 def test_exchange_goes_on_where_one_set_at_a_time_stops() -> None:
     world = headings(3, 0.7, cost=0.12, memory="displacement")
     renewal = Renewal(world, world.motion)
-    none = [np.zeros(len(choice.rows), dtype=bool) for choice in renewal.choices]
+    none = [np.zeros((len(choice.rows), 1), dtype=bool) for choice in renewal.choices]
     start = Found(renewal, none)
     one = search.ascended(start)
     assert exchange.exchanged(start).aihtr > one.aihtr > start.aihtr
@@ -101,7 +101,7 @@ def test_a_child_has_the_plans_of_two(monkeypatch: pytest.MonkeyPatch) -> None:
     world = headings(3, 0.7, cost=0.12, memory="displacement")
     search, begun = hidden.Search(world, hidden.WHOLE), list[Found]()
     renewal, rng = search.renewal, np.random.default_rng(0)
-    every, none = ([np.full(len(c.rows), on) for c in renewal.choices] for on in (True, False))
+    every, none = ([np.full((len(c.rows), 1), on) for c in renewal.choices] for on in (True, False))
     better = exchange.exchanged(Found(renewal, none))
     monkeypatch.setattr(hidden, "exchanged", lambda *a, **_: begun.append(a[0]) or better)
     pool = search.crossed([Found(renewal, every), Found(renewal, none)], 1, rng)
@@ -121,7 +121,9 @@ def test_a_child_takes_the_place_of_the_parent_that_it_is_like(
     world = headings(3, 0.7, cost=0.12, memory="displacement")
     renewal = hidden.Search(world, hidden.WHOLE).renewal
     low, middle, child = (
-        Found(renewal, [np.arange(len(choice.rows)) % 4 < on for choice in renewal.choices])
+        Found(
+            renewal, [np.arange(len(choice.rows))[:, None] % 4 < on for choice in renewal.choices]
+        )
         for on in (0, 1, 3)
     )
     assert low.aihtr < middle.aihtr < child.aihtr
@@ -142,7 +144,8 @@ def test_no_sets_are_searched_twice_and_a_search_that_finds_nothing_new_ends(
     search = hidden.Search(world, hidden.WHOLE)
     renewal = search.renewal
     every, none = (
-        Found(renewal, [np.full(len(c.rows), on) for c in renewal.choices]) for on in (True, False)
+        Found(renewal, [np.full((len(c.rows), 1), on) for c in renewal.choices])
+        for on in (True, False)
     )
     monkeypatch.setattr(hidden, "_OLD", old)
     monkeypatch.setattr(

@@ -31,7 +31,7 @@ def listed(
 ) -> tuple[Array, list[BoolArray]] | None:
     """From sensing nothing, over the values `[Z]` of a detection."""
     renewal, left = Renewal(world, world.motion), most
-    none = [np.zeros(len(choice.rows), dtype=bool) for choice in renewal.choices]
+    none = [np.zeros((len(choice.rows), 1), dtype=bool) for choice in renewal.choices]
     detected = world.reward + value
     one_more = revealed(world, detected, forced_worth(world, detected), 1)
 

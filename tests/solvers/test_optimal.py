@@ -27,7 +27,7 @@ from trackmdp.solvers.certify import delayed
 from trackmdp.solvers.certify.inner import InnerProblem
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.renewal import Renewal
-from trackmdp.solvers.search import Found, candidates_of, columns_of
+from trackmdp.solvers.search import Found
 from trackmdp.solvers.solution import SearchProgress
 from trackmdp.world.model import World
 
@@ -87,7 +87,7 @@ def test_the_search_ends_where_no_single_set_can_be_improved(world: World) -> No
     problem = InnerProblem.of(renewal, value)
     worth = problem.worth(sets)
     np.testing.assert_allclose(worth, value, rtol=1e-9, atol=1e-9)
-    ascended = columns_of(problem.plans().ascend(candidates_of(sets), sweeps=1))
+    ascended = problem.plans().ascend(sets, sweeps=1)
     np.testing.assert_allclose(problem.worth(ascended), worth, rtol=1e-9, atol=1e-9)
 
 

@@ -35,7 +35,6 @@ from trackmdp.sensing.task import Task
 from trackmdp.solvers import bounds
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.renewal import Renewal
-from trackmdp.solvers.search import candidates_of
 from trackmdp.solvers.solve import solve
 from trackmdp.solvers.value import key_visits, visits_of
 from trackmdp.world.model import World
@@ -154,10 +153,11 @@ def test_searches_value_policies_as_evaluation_does(problem: Problem, seed: int)
     policy = random_policy(problem, seed)
     renewal = Renewal(problem, problem.motion)
     sets = renewal.sets(policy)
-    value, visits = renewal.value(sets), visits_of(renewal.system(sets)[0], renewal.start)
+    system, earned = renewal.system(sets)
+    value, visits = system.solve(earned), visits_of(system, renewal.start)
     table = renewal.table(sets)  # without the sensors that cannot see the target
     assert value[renewal.first].mean() == pytest.approx(evaluate(problem, table).aihtr, abs=1e-9)
-    worth = renewal.problem(value, visits).worth(candidates_of(sets))[:, 0]
+    worth = renewal.problem(value, visits).worth(sets)[:, 0]
     known = renewal.count - renewal.events.forced
     expected = np.bincount(renewal.owner[:known], (visits * value)[:known], len(renewal.plans))
     close(worth, expected)

@@ -17,7 +17,6 @@ from trackmdp.solvers.certify.inner import InnerProblem
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.exchange import exchange
 from trackmdp.solvers.renewal import Renewal
-from trackmdp.solvers.search import candidates_of, columns_of
 from trackmdp.solvers.solution import SearchProgress, Solution
 from trackmdp.world.make import make_world
 from trackmdp.world.model import World
@@ -73,7 +72,7 @@ def test_a_round_is_the_round_of_the_whole_grid_whatever_the_side() -> None:
     value = evaluate(world, policy).value
     renewal = Renewal(world, world.motion)
     plans = InnerProblem.of(renewal, value).plans()
-    sets = columns_of(plans.ascend(candidates_of(renewal.sets(policy)), sweeps=10))
+    sets = plans.ascend(renewal.sets(policy), sweeps=10)
     whole = renewal.table(exchange(plans, sets, np.ones(world.num_cells, dtype=bool))).dense()
     for side in (3, 4, 11):
         found = regions.improved(world, policy, value, side, lambda _: True)

@@ -20,7 +20,6 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.sensing.task import Task
 from trackmdp.solvers.exchange import exchange
 from trackmdp.solvers.plans import Plans
-from trackmdp.solvers.search import candidates_of, columns_of
 
 _ROUNDS, _JUDGES, _SURE = 3, 10, 3.0
 """Rounds at most; batches of paths that judge; standard errors of its gain that a proposal has to exceed."""
@@ -83,15 +82,17 @@ class _Paths:
         return Plans(self._layout, np.ones(self._count), detected, missed)
 
     def sets(self, policy: PolicyTable) -> list[BoolArray]:
-        """Its decisions here, `[G]` for each free choice."""
+        """Its decisions here, `[G, 1]` for each free choice."""
         choices = (turn.choice for turn in self._layout.turns)
-        return [policy.chosen(n, each.rows, each.sensors) > 0 for n, each in enumerate(choices)]
+        return [
+            policy.chosen(n, each.rows, each.sensors)[:, None] > 0 for n, each in enumerate(choices)
+        ]
 
     def value(self, sets: list[BoolArray]) -> Array:
         """V `[keys]` of a policy: V = b + K V, K the discounted chance of the key at the next detection."""
         count, plans = self._count, self.plans(np.zeros(self._count))
         chances, mass = list[Array](), plans.mass
-        for turn, on in zip(plans.turns, candidates_of(sets), strict=True):
+        for turn, on in zip(plans.turns, sets, strict=True):
             mass = turn.back @ mass
             chances.append(mass * turn.choice.report(on))
             mass = mass - chances[-1]
@@ -107,11 +108,12 @@ class _Paths:
     def proposed(self, policy: PolicyTable, value: Array) -> PolicyTable:
         """The policy of the plans that exchange finds."""
         plans = self.plans(value)
-        sets = columns_of(plans.ascend(candidates_of(self.sets(policy)), sweeps=2))
+        sets = plans.ascend(self.sets(policy), sweeps=2)
         found = exchange(plans, sets, np.ones(self._count, dtype=bool))
         choices = (turn.choice for turn in plans.turns)
         return PolicyTable.from_sensed(
-            self._task, [(c.rows[on], c.sensors[on]) for c, on in zip(choices, found, strict=True)]
+            self._task,
+            [(c.rows[on[:, 0]], c.sensors[on[:, 0]]) for c, on in zip(choices, found, strict=True)],
         )
 
     def gain(self, before: PolicyTable, after: PolicyTable, value: Array) -> Array:

@@ -218,10 +218,10 @@ class ModelBased(Checkpointed):
 
     def _beliefs(self, plan: PolicyTable, world: World) -> dict[str, float]:
         """AIHTR of a plan by the posterior mean, and its standard deviation over kernels that are drawn."""
-        mean = value_of(world, plan, per_cell=False)
+        mean = value_of(world, plan)
         others = map(self._world, self._estimate.samples(self._rng, _SAMPLES))
         # Each begins with the mean kernel's values, which counts where the grid is too large to factorise.
-        worth = [value_of(other, plan, guess=mean.value, per_cell=False).aihtr for other in others]
+        worth = [value_of(other, plan, guess=mean.value).aihtr for other in others]
         return {"believed_aihtr": mean.aihtr, "believed_deviation": float(np.std(worth))}
 
     def _diagnostics(self) -> dict[str, float]:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from scipy import sparse
 
 from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
+
+# Numbers of a matrix whose rows are added up as those of a dense one, 32 MB: kernels of up to 2,048 states.
+_SMALL = 2**22
 
 
 def row_index(matrix: sparse.csr_array) -> IndexArray:
@@ -47,6 +51,13 @@ def summing(index: IndexArray, count: int) -> sparse.csr_array:
 def per_row(rows: IndexArray, values: Array, count: int) -> Array:
     """`[count]` sums of `values` over equal `rows`."""
     return np.bincount(rows, weights=values, minlength=count).astype(np.float64, copy=False)
+
+
+def row_sums(matrix: sparse.csr_array) -> Array:
+    """`[R]` sums of the rows."""
+    # NumPy adds dense rows pairwise: so a small kernel, sparse or written out, has the same sums to the bit.
+    small = math.prod(matrix.shape) <= _SMALL
+    return np.asarray((matrix.toarray() if small else matrix).sum(axis=1))
 
 
 def padded_rows(

@@ -9,9 +9,8 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order
 
-from trackmdp.arrays.entries import ones_at, row_index, short_indices
+from trackmdp.arrays.entries import ones_at, row_index, row_sums, short_indices
 from trackmdp.arrays.numbers import array_of
-from trackmdp.arrays.rows import pairwise_row_sums
 from trackmdp.errors import UserError
 
 
@@ -69,7 +68,7 @@ def check_kernel(
         raise UserError(f"{source}: row {_row(kernel, ~finite)} holds a value that is not finite")
     if (negative := kernel.data < 0).any():
         raise UserError(f"{source}: row {_row(kernel, negative)} holds a negative probability")
-    sums = pairwise_row_sums(kernel)
+    sums = row_sums(kernel)
     if (high := sums > 1 + 1e-9).any():
         row = int(np.flatnonzero(high)[0])
         raise UserError(

@@ -13,9 +13,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.entries import ones_at
+from trackmdp.arrays.entries import ones_at, row_sums
 from trackmdp.arrays.files import read_matrix
-from trackmdp.arrays.rows import merged, pairwise_row_sums
 from trackmdp.arrays.types import Array, BoolArray, Indices
 from trackmdp.grid.displacements import cell_at
 from trackmdp.grid.size import Size, grid_size
@@ -166,17 +165,17 @@ def _place(
     target, inside = _moved(grid, cells, offsets, clip=border == "clip")
     # A weight of 0 makes no entry: the padding of rows with fewer positions, above all.
     inside &= weights != 0
-    row, target = np.nonzero(inside)[0], target[inside]
-    # Entries of one place are added up in the order given: `lexsort` is stable, SciPy's `sum_duplicates` is not.
-    order = np.lexsort((target, row))
-    row, target, total = merged(row[order], target[order], weights[inside][order])
-    rows = sparse.csr_array((total, (row, target)), shape=(len(cells), grid[0] * grid[1]))
+    shape = len(cells), grid[0] * grid[1]
+    # Entries of one place are added up in the order given, which SciPy's `sum_duplicates` may change.
+    codes, place = np.unique(np.nonzero(inside)[0] * shape[1] + target[inside], return_inverse=True)
+    total = np.bincount(place, weights[inside])
+    rows = sparse.csr_array((total, np.divmod(codes, shape[1])), shape=shape)
     if border in ("renormalize", "inside"):
         empty = np.flatnonzero(np.diff(rows.indptr) == 0)
         stays = ones_at(empty, cells[empty], rows.shape, np.float64)
         rows = rows + stays
         # All of a row by one factor, so that the exit keeps its probability and the positions their proportions.
-        rows.data *= np.repeat(totals / pairwise_row_sums(rows), np.diff(rows.indptr))
+        rows.data *= np.repeat(totals / row_sums(rows), np.diff(rows.indptr))
     return rows
 
 

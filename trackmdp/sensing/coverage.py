@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.arrays.entries import ones_at, row_index, with_data
+from trackmdp.arrays.entries import ones_at, row_index
 from trackmdp.arrays.numbers import array_of
 from trackmdp.errors import UserError
 from trackmdp.grid.displacements import cell_at
@@ -113,29 +113,16 @@ def reported(
     """
     if k is not None:
         return _of_subsets(sets, sees, k)
-    # Of a set drawn with probabilities q, sensor s stays silent with 1 - q p; log Π = Σ log(1 - q p), and a sensor that
-    # certainly reports gives -inf, and so exactly 1. With q = 1 or p = 1 everywhere the logs are a sparse product.
-    certain = (sets.data == 1.0).all()
-    with np.errstate(divide="ignore"):
-        if certain or (sees.data == 1.0).all():
-            shared, own = (sees, sets) if certain else (sets, sees)
-            logs = with_data(shared, np.log1p(-shared.data.astype(np.float64)))
-            found = own.astype(np.float64) @ logs if certain else logs @ own
-        else:
-            found = _each_log(sets, sees)
-    found.data = -np.expm1(found.data)
-    found.sort_indices()
-    return found
-
-
-def _each_log(sets: sparse.csr_array, sees: sparse.csr_array) -> sparse.csr_array:
-    """`[R, M]` Σ log(1 - q p) over the sensors, pair by pair."""
     rows, each = row_index(sets), sees[sets.indices]
     place = row_index(each)
-    logs = np.log1p(-sets.data[place] * each.data)
-    return sparse.csr_array(
-        (logs, (rows[place], each.indices)), shape=(sets.shape[0], sees.shape[1])
-    )
+    # Of a set drawn with probabilities q, sensor s stays silent with 1 - q p; log Π = Σ log(1 - q p), and a sensor that
+    # certainly reports gives -inf, and so exactly 1.
+    with np.errstate(divide="ignore"):
+        logs = np.log1p(-(sets.data[place] * each.data))
+    shape = sets.shape[0], sees.shape[1]
+    found = sparse.csr_array((logs, (rows[place], each.indices)), shape=shape)
+    found.data = -np.expm1(found.data)
+    return found
 
 
 def _of_subsets(sets: sparse.csr_array, sees: sparse.csr_array, k: int) -> sparse.csr_array:

@@ -14,7 +14,7 @@ from scipy.special import expit
 
 from trackmdp.arrays.types import Array
 from trackmdp.solvers.renewal import Renewal
-from trackmdp.solvers.search import Found, candidates_of, columns_of, credit_of
+from trackmdp.solvers.search import Found, credit_of
 
 _STEPS, _HOT, _WARM, _COLD = 40, 0.2, 0.03, 0.01
 """Temperatures; the first one, where the optimistic credit leads as well; and the last, in rewards."""
@@ -35,7 +35,7 @@ def anneal(renewal: Renewal, rng: np.random.Generator, *, led: bool = False) -> 
     """
     world = renewal.world
     odds, off = (
-        [spread * rng.standard_normal(len(choice.rows)) for choice in renewal.choices]
+        [spread * rng.standard_normal((len(choice.rows), 1)) for choice in renewal.choices]
         for spread in (_SPREAD, _OFF * world.reward)
     )
     credit, policy = credit_of(world) if led else None, None
@@ -44,20 +44,20 @@ def anneal(renewal: Renewal, rng: np.random.Generator, *, led: bool = False) -> 
         chances = _chances(renewal, odds)
         policy = Found(renewal, chances, policy)
         plans = policy.plans(credit)
-        advantages = plans.advantages(candidates_of(chances), share)
+        advantages = plans.advantages(chances, share)
         # Half of the odds before are kept: best answers of all sensors at once overshoot.
         odds = [
             (before + (gain + share * error) / (temperature * world.reward)) / 2
             for before, gain, error in zip(odds, advantages, off, strict=True)
         ]
     sets = [chance > 0.5 for chance in _chances(renewal, odds)]
-    return Found(renewal, columns_of(plans.ascend(candidates_of(sets), sweeps=1)), policy)
+    return Found(renewal, plans.ascend(sets, sweeps=1), policy)
 
 
 def _chances(renewal: Renewal, odds: list[Array]) -> list[Array]:
-    """`[G]` for each free choice; 0 of sensors that may not be on."""
+    """`[G, 1]` for each free choice; 0 of sensors that may not be on."""
     found = []
     for choice, each in zip(renewal.choices, odds, strict=True):
         chance = expit(each)
-        found.append(chance if choice.allowed is None else chance * choice.allowed[:, 0])
+        found.append(chance if choice.allowed is None else chance * choice.allowed)
     return found

@@ -107,10 +107,8 @@ def _earned(world: World) -> Array:
 
 def safe_gain(world: World) -> Array:
     """`[Z]` expected reward of one safe action before which the target is in each state."""
-    gain: Array = (world.reward - world.safe_cost) * world.stay_probability
-    if world.safe:
-        return gain
     missed = 1.0 - world.safe_detection[world.motion.cell]
+    gain: Array = (world.reward - world.safe_cost) * world.stay_probability
     return gain - world.reward * (world.kernel @ missed)
 
 
@@ -277,10 +275,9 @@ def _improved(world: World, table: Array, choices: _Choices, *, exact: bool) -> 
 def _one_step(world: World, table: Array, *, exact: bool = False) -> Array:
     """`[Z, t_max + 2]`, the best choice or, last, the safe action, then `table`; with footprints no less than that."""
     # n = t_max + 1: r - D, and located again, whose clock is 0; or missed, and the safe action again.
+    missed = 1.0 - world.safe_detection[world.motion.cell]
     safe = world.reward - world.safe_cost + table[:, 0]
-    if not world.safe:
-        missed = 1.0 - world.safe_detection[world.motion.cell]
-        safe = safe - missed * (world.reward + table[:, 0] - table[:, -1])
+    safe = safe - missed * (world.reward + table[:, 0] - table[:, -1])
     best: Array = world.kernel @ np.column_stack([table[:, 1:], safe])
     for n in range(world.num_choices):
         worth = _reports_worth(world, table, n)

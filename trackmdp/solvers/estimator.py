@@ -78,8 +78,9 @@ def positions(world: World, policy: PolicyTable, value: Array) -> list[PositionE
     for n, (step, sensed) in enumerate(zip(renewal.steps, renewal.sets(policy), strict=False)):
         predicted = mass @ step.moves
         before = per_row(step.before, mass, world.num_cells)
-        estimates.append(_estimate(world, step, predicted, before, value, later[n], ~sensed))
-        mass = predicted * ~sensed
+        left = ~sensed[:, 0]
+        estimates.append(_estimate(world, step, predicted, before, value, later[n], left))
+        mass = predicted * left
     return estimates
 
 

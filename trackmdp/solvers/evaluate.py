@@ -27,9 +27,7 @@ def evaluate(
     problem: Problem,
     policy: PolicyLike | Array | BoolArray,
     *,
-    guess: Array | None = ...,
     false_alarm: float = ...,
-    per_cell: bool = ...,
 ) -> Evaluation: ...
 @overload
 def evaluate(
@@ -46,9 +44,7 @@ def evaluate(
     problem: Problem | Group,
     policy: PolicyLike | Array | BoolArray,
     *,
-    guess: Array | None = None,
     false_alarm: float = 0.0,
-    per_cell: bool = True,
     **of_group: Any,
 ) -> Evaluation | GroupEvaluation:
     """The figures of `policy`: exact on a `World`, from a replay on the held-out tracks of a `Recorded`.
@@ -60,11 +56,8 @@ def evaluate(
         policy: a `Policy` or its table, or the same dense, `[M, t_max + 1, M]`; a TensorDict module or a function
             that does not draw (`Policy.from_function`); a `Run`, a `Solution`, a model of Stable-Baselines3; or the
             name of a baseline.
-        guess: `[M]`, where the solve begins on a grid too large to factorise, such as the clocked bound.
         false_alarm: p_f, with which a sensor that is on reports the target in a step in which it is not there; the
             policy takes each report for the truth (`trackmdp.solvers.false_alarms`).
-        per_cell: whether detections, sensors and safe actions are wanted of each start cell as well, which takes half
-            as long again on a grid too large to factorise (a smaller one has them for nothing).
         **of_group: of a `Group` alone: `merge`, "gains" or "union" (the default on recorded tracks); `width`, half of
             the 95 % interval of the reward per step that is wanted, .005; and `seed` of the targets.
 
@@ -82,7 +75,7 @@ def evaluate(
     if false_alarm:
         value.check_revealed(problem.motion, table)
         return believed(problem, table, false_alarm)
-    return value.value_of(problem, table, guess=guess, per_cell=per_cell)
+    return value.value_of(problem, table)
 
 
 def _of_group(

@@ -25,8 +25,8 @@ class Evaluation(Carded):
         safe_per_episode: forced safe actions per episode.
         expected_length: steps per episode, the exit step included.
         steps: `[M]`, steps in the grid per episode from each start cell.
-        detections, sensors, safe_actions: `[M]`, the same of these; None where they were not asked for
-            (`evaluate`, `per_cell`) and the system was too large to factorise.
+        detections, sensors, safe_actions: `[M]`, the same of these; None where the system was too
+            large to factorise.
         error: no entry of `value` is farther from the exact one; 0 where the system was factorised.
         starts: `[F]`, value of each start of an episode: of each hidden state, or of each recorded track.
     """

@@ -34,9 +34,7 @@ from trackmdp.solvers.search import (
     GoOn,
     always,
     ascended,
-    candidates_of,
     clocked_sets,
-    columns_of,
     follow_credit,
     led,
     mixed,
@@ -117,7 +115,7 @@ def best_of(
     start = policy
     for other in others:
         plans = policy.plans()
-        after = columns_of(plans.ascend(candidates_of(other), sweeps=10))
+        after = plans.ascend(other, sweeps=10)
         # Where these are the plans at hand, exchange has been tried.
         tried = exchange(plans, after, rows_changed(plans.layout, policy.sets, after), go_on)
         worth, other_worth = (plans.worth_of(each) for each in (policy.sets, tried))
@@ -154,7 +152,7 @@ def exchanged(
         else:
             plans = renewal.problem(policy.value, policy.visits)
             some = tried & (renewal.by_plan(policy.visits) > _SEEN)
-        sets = columns_of(plans.ascend(candidates_of(policy.sets), sweeps=10))
+        sets = plans.ascend(policy.sets, sweeps=10)
         sets = exchange(plans, sets, some, go_on)
         better = risen(policy, plans, sets)
         if better is not None:
@@ -202,7 +200,7 @@ def exchange(
 
     Args:
         plans: the problem of each row.
-        sets: `[G]` for each step; left as they are.
+        sets: `[G, 1]` for each step; left as they are.
         rows: `[K]`, the rows of the plans that may change.
         go_on: see `GoOn`.
     """
@@ -253,8 +251,8 @@ def _cut(plans: Plans, rows: IndexArray) -> tuple[Plans, list[IndexArray]]:
 
 
 def _exchanged(plans: Plans, sets: Sequence[BoolArray]) -> list[BoolArray]:
-    """The better plans `[G]` for each step."""
-    plan = candidates_of(sets)
+    """The better plans `[G, 1]` for each step."""
+    plan = list(sets)
     worth = plans.worth(plan)
     for step in range(1, plans.length):
         mass = plans.pushed(plan, step)
@@ -264,7 +262,7 @@ def _exchanged(plans: Plans, sets: Sequence[BoolArray]) -> list[BoolArray]:
         later = plans.ascend(plan[step:], mass=left, since=step, sweeps=LATER_SWEEPS)
         every = plans.ascend([*plan[: step - 1], first, *later], sweeps=ALL_SWEEPS)
         plan, worth = _better(plans, plan, worth, every)
-    return columns_of(plan)
+    return plan
 
 
 def _better(

@@ -181,7 +181,7 @@ class _Trace:
             return sensors
         # Without rewards the value of an episode is its payment for sensors.
         paid = replace(self.world, cost=self.weights, reward=0.0, safe_cost=0.0)
-        return max(0.0, -value_of(paid, table, per_cell=False).aihtr / self.steps)
+        return max(0.0, -value_of(paid, table).aihtr / self.steps)
 
     def ends(self) -> None:
         """The corners of the lowest and of the highest price."""

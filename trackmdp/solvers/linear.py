@@ -10,7 +10,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from functools import cached_property, lru_cache
-from itertools import pairwise
 
 import numpy as np
 from scipy import sparse
@@ -21,7 +20,6 @@ from scipy.sparse.linalg import splu, spsolve_triangular
 from trackmdp.arrays.entries import short_indices, summing
 from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.errors import UserError
-from trackmdp.recordings.tracks import ends_of
 from trackmdp.world.model import World
 
 DIRECT_CELLS = 20_000
@@ -44,8 +42,6 @@ _LAST_BITS = 4.0 * float(np.finfo(np.float64).eps)
 # Where some cells have no way out, I - P is singular; if rounding lets the solve pass, lengths come out negative or
 # about 1 / 1e-16. No kernel that is meant to end comes near 1e12 steps.
 _LONGEST_EPISODE = 1e12
-# Events a level, on average, from which a pass over the levels is the faster one, up to twice as fast.
-_FEWEST = 1_000
 _ENDLESS = (
     "kernel: from some cell the target never exits, so no value is finite: "
     "expected an exit reachable from each cell"
@@ -246,12 +242,17 @@ class _Level:
         # Galerkin: with B [M, blocks] the indicator of the blocks, B^T A B is the system seen by vectors that are
         # constant on each block.
         coarse = short_indices(sparse.csr_array(self._sums @ system @ self._blocks))
-        small = coarse.shape[0] <= _COARSEST or not isinstance(size, tuple)
-        self._below: _Level | None = None
-        if not small:
-            assert isinstance(size, tuple)
-            self._below = _Level(coarse, (-(-size[0] // _BLOCK), -(-size[1] // _BLOCK)))
-        self._solve = _factorised(coarse) if small else None
+        if coarse.shape[0] <= _COARSEST or not isinstance(size, tuple):
+            solve = _factorised(coarse)
+            self._corrected: Callable[[Array], Array] = lambda left: solve(left, False)
+            return
+        below = _Level(coarse, (-(-size[0] // _BLOCK), -(-size[1] // _BLOCK)))
+
+        def twice(left: Array) -> Array:
+            guess = below(left)
+            return guess + below(left - coarse @ guess)
+
+        self._corrected = twice
 
     def __call__(self, residual: Array) -> Array:
         """`[KM]`, about the solution of system x = `residual`."""
@@ -262,14 +263,6 @@ class _Level:
         left *= self._damping
         guess += left
         return guess
-
-    def _corrected(self, residual: Array) -> Array:
-        """The solution on the blocks."""
-        if self._below is None:
-            assert self._solve is not None
-            return self._solve(residual, False)
-        guess = self._below(residual)
-        return guess + self._below(residual - self._below._system @ guess)
 
 
 def accumulate(
@@ -347,44 +340,24 @@ def summed_over(moves: sparse.csr_array, gathered: Array, steps: int) -> Array:
     return found
 
 
-class Levels:
+def solve_onward(
+    level: IndexArray, transition: sparse.csr_array, gathered: Array, *, transposed: bool = False
+) -> Array:
     """Solves ``v = gathered + transition v`` where each event leads to events of higher levels alone.
-
-    All events of a level are found together, from those above it.
 
     Args:
         level: `[B]`, of each event.
+        transition: `[B, B]`.
+        gathered: `[B]` or `[B, K]`, as the result is.
+        transposed: solve ``v = gathered + transition^T v`` instead.
     """
-
-    def __init__(self, level: IndexArray) -> None:
-        self._order = np.argsort(level, kind="stable")
-        self._first = ends_of(np.bincount(level))
-
-    def solve(
-        self, transition: sparse.csr_array, gathered: Array, *, transposed: bool = False
-    ) -> Array:
-        """`[B]` or `[B, K]` v; `transposed`: v = gathered + transition^T v."""
-        if len(self._order) < _FEWEST * len(self._first):
-            return self._one_by_one(transition, gathered, transposed)
-        # What is above comes first; of the transposed matrix, in which events follow from lower levels, what is below.
-        levels = list(pairwise(self._first))[:: 1 if transposed else -1]
-        sorted_ = (transition.T.tocsr() if transposed else transition)[self._order]
-        found = gathered.copy()
-        for begin, end in levels:
-            found[self._order[begin:end]] += sorted_[begin:end] @ found
-        return found
-
-    def _one_by_one(self, transition: sparse.csr_array, gathered: Array, transposed: bool) -> Array:
-        sorted_ = transition[self._order][:, self._order]
-        system = sparse.eye_array(len(gathered), format="csr") - sorted_
-        found = np.empty_like(gathered)
-        found[self._order] = spsolve_triangular(
-            system.T if transposed else system,
-            gathered[self._order],
-            lower=transposed,
-            unit_diagonal=True,
-        )
-        return found
+    order = np.argsort(level, kind="stable")
+    system = sparse.eye_array(len(order), format="csr") - transition[order][:, order]
+    found = np.empty_like(gathered)
+    found[order] = spsolve_triangular(
+        system.T if transposed else system, gathered[order], lower=transposed, unit_diagonal=True
+    )
+    return found
 
 
 def check_length(steps: Array) -> None:

@@ -57,13 +57,13 @@ def solve(world: World, *, depth: int = 2, tail: Tail = "clocked") -> PolicyTabl
         detected, missed = world.reward + tails[:, 0], tails[:, n + ahead]
         problem = InnerProblem(renewal, detected, missed, ahead, first=n)
         sets.append(_first_set(problem, mass, states))
-        report = renewal.choices[n].report(sets[-1][:, None])[:, 0]
+        report = renewal.choices[n].report(sets[-1])[:, 0]
         mass, states = (mass @ renewal.steps[n].moves) * (1.0 - report), renewal.steps[n].states
     return renewal.table(sets)
 
 
 def _first_set(problem: InnerProblem, mass: Array, states: IndexArray) -> BoolArray:
-    """`[G]` the first set of the best plan from each located cell; `mass` `[E]` is undetected in `states` `[E]`."""
+    """`[G, 1]` the first set of the best plan from each located cell; `mass` `[E]` is undetected in `states` `[E]`."""
     world, run = problem.world, up_to(_MOST_NODES)
     known = tables(problem, slack=_SLACK, run=run)
     sets = first_guess(problem, known, mass)

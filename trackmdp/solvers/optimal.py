@@ -128,7 +128,7 @@ class _Run:
         self.evaluation = self.valued(self.policy, self.bound)
 
     def valued(self, policy: PolicyTable, guess: Array) -> Evaluation:
-        return value_of(self.world, policy, guess=guess, per_cell=False)
+        return value_of(self.world, policy, guess=guess)
 
     @property
     def value(self) -> Array:
@@ -359,21 +359,15 @@ class _Run:
         self.bound = np.minimum(self.bound, self.value + more)
 
     def solution(self, interrupted: bool) -> Solution:
-        bound = of_cells(self.world, np.maximum(self.bound, self.value))
-        certified = self.certified
-        seconds, timed_out = (
-            time.monotonic() - self.budget.started,
-            self.budget.timed_out and not certified,
-        )
         return Solution(
             self.policy,
             self.evaluation,
-            bound,
-            certified,
-            seconds,
+            of_cells(self.world, np.maximum(self.bound, self.value)),
+            self.certified,
+            time.monotonic() - self.budget.started,
             self.budget.spent,
             interrupted,
-            timed_out,
+            self.budget.timed_out and not self.certified,
         )
 
 

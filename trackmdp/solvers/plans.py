@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.entries import summing
+from trackmdp.arrays.entries import summing, with_data
 from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
 from trackmdp.sensing.decisions import Decisions
 
@@ -59,23 +59,16 @@ class Layout:
     def __init__(self, rows: IndexArray, turns: Sequence[Turn], count: int) -> None:
         self.turns, self.count = list(turns), count
         self.rows = [rows, *(turn.rows for turn in turns)]
-        self._sums: dict[int, sparse.csr_array] = {}
-        self._pay: dict[int, sparse.csr_array] = {}
 
-    def sums(self, t: int) -> sparse.csr_array:
-        """`[K, E]`, sums over the entries of each row after step t."""
-        if t not in self._sums:
-            self._sums[t] = summing(self.rows[t], self.count)
-        return self._sums[t]
+    @cached_property
+    def sums(self) -> list[sparse.csr_array]:
+        """`[K, E]` for the start and each step, sums over the entries of each row."""
+        return [summing(rows, self.count) for rows in self.rows]
 
-    def pay(self, t: int) -> sparse.csr_array:
-        """`[K, G]`, prices of the decisions of each row at step t."""
-        if t not in self._pay:
-            turn = self.turns[t - 1]
-            place = (turn.choice.rows, np.arange(len(turn.price)))
-            shape = (self.count, len(turn.price))
-            self._pay[t] = sparse.csr_array((turn.price, place), shape=shape)
-        return self._pay[t]
+    @cached_property
+    def pay(self) -> list[sparse.csr_array]:
+        """`[K, G]` for each free choice, prices of the decisions of each row, which are in order."""
+        return [with_data(summing(turn.choice.rows, self.count), turn.price) for turn in self.turns]
 
 
 class Plans:
@@ -114,7 +107,7 @@ class Plans:
         # In place: new arrays would take as long as the sums.
         ahead = (self.detected[t - 1] - later) * turn.choice.report(on)
         ahead += later
-        paid = (self.layout.pay(t) @ on)[self.layout.rows[t - 1]]
+        paid = (self.layout.pay[t - 1] @ on)[self.layout.rows[t - 1]]
         paid *= turn.stay[:, None]
         return turn.moves @ ahead - paid
 
@@ -128,11 +121,11 @@ class Plans:
     def worth(self, sets: Sequence[BoolArray]) -> Array:
         """`[K, C]`, expected reward of whole plans."""
         start = self.undetected(1, sets[0], self.after(sets)[0])
-        return self.layout.sums(0) @ (self.mass * start)
+        return self.layout.sums[0] @ (self.mass * start)
 
     def worth_of(self, sets: Sequence[BoolArray]) -> Array:
-        """`[K]`, the same of one candidate, `[G]` for each step."""
-        return self.worth([on[:, None] for on in sets])[:, 0]
+        """`[K]`, the same of one candidate."""
+        return self.worth(sets)[:, 0]
 
     def missing(self, t: int, on: AnyArray, mass: Array) -> Array:
         """`[E, C]`, the part of `mass` at step t that the set `on` leaves undetected."""
@@ -151,7 +144,7 @@ class Plans:
 
     def _come(self, t: int, mass: Array) -> Array:
         """`[G, C]`, the part of `mass` `[E, C]` at step t that is in the row of each decision."""
-        return (self.layout.sums(t) @ mass)[self.turns[t - 1].choice.rows]
+        return (self.layout.sums[t] @ mass)[self.turns[t - 1].choice.rows]
 
     def ascend(
         self,
@@ -192,7 +185,7 @@ class Plans:
         return sets
 
     def advantages(self, chances: Sequence[Array], optimism: float) -> list[Array]:
-        """`[G]` for each step: what a sensor's being on gains over its being off, given that its plan comes so far.
+        """`[G, 1]` for each step: what a sensor's being on gains over its being off, given that its plan comes so far.
 
         Args:
             chances: `[G, 1]` for each step, probabilities with which the sensors are on, independently of each other.
@@ -205,7 +198,7 @@ class Plans:
             gain = turn.choice.slope(now * self._gain(t, later, optimism), on)
             come = self._come(t, now)
             net = gain - turn.price[:, None] * come
-            found.append(np.divide(net, come, out=np.zeros_like(net), where=come > 0)[:, 0])
+            found.append(np.divide(net, come, out=np.zeros_like(net), where=come > 0))
             now = self.missing(t, on, now)
         return found
 

@@ -37,7 +37,6 @@ from trackmdp.solvers.partition import (
     within,
 )
 from trackmdp.solvers.renewal import Renewal
-from trackmdp.solvers.search import candidates_of, columns_of
 from trackmdp.solvers.value import value_of
 from trackmdp.solvers.workers import Crew, Made, in_turn
 from trackmdp.world.model import World
@@ -90,14 +89,14 @@ class _Region:
     def improved(self) -> list[Pairs]:
         """The sensors on after ascent and exchange; see `sensed`."""
         plans = self.problem.plans()
-        sets = columns_of(plans.ascend(candidates_of(self.sets), sweeps=10))
+        sets = plans.ascend(self.sets, sweeps=10)
         return self.sensed(exchange(plans, sets, self.own & hopeful(plans, sets, self.most)))
 
     def sensed(self, sets: Sequence[BoolArray]) -> list[Pairs]:
         """The sensors on at each n, of its own located cells, numbered as on the whole grid."""
         found = []
         for choice, on in zip(self.problem.renewal.choices, sets, strict=True):
-            mine = on & self.own[choice.rows]
+            mine = on[:, 0] & self.own[choice.rows]
             found.append((self.cells[choice.rows[mine]], self.cells[choice.sensors[mine]]))
         return found
 
@@ -216,12 +215,12 @@ def settled(
     Blocks that planned without each other's values leave plans that none of them would change: .006 per step at
     c = .22, T_max 2, blocks of 5 and a halo of 4.
     """
-    value = value_of(world, policy, per_cell=False).value
+    value = value_of(world, policy).value
     for _ in range(rounds):
         candidate = PolicyTable.from_sensed(
             world, end_to_end(run(_Region.improved, _regions(world, policy, value, side)))
         )
-        after = value_of(world, candidate, guess=value, per_cell=False).value
+        after = value_of(world, candidate, guess=value).value
         # As in `exchange`: no value is lower, so the sum decides; the margin is rounding.
         if after.sum() <= value.sum() + 1e-12 * np.abs(value).sum():
             break

@@ -41,7 +41,7 @@ Act: TypeAlias = tuple[AnyArray, Array]
 
 
 class Renewal:
-    """All renewals of a task with a motion; sets are bools `[G]`, a list of one for each free choice.
+    """All renewals of a task with a motion; sets are bools `[G, 1]`, a list of one for each free choice.
 
     Args:
         task: sensors, prices and limits.
@@ -123,19 +123,19 @@ class Renewal:
         return np.bincount(self.first, minlength=self.count) / len(self.first)
 
     def passes(self, acts: Iterable[Act]) -> list[Passed]:
-        """The steps of all events under a policy, with their rewards alone."""
+        """The steps of all events under a policy; sensors are not counted."""
         task, found = self.task, []
         mass = np.ones(self.normal)
         for step, (report, spent) in zip(self.steps, acts, strict=False):
-            now, mass = passed(task, step, mass, report, spent, None)
+            now, mass = passed(task, step, mass, report, spent, 0.0)
             found.append(now)
-        return [*found, passed_last(task, self.motion, self.steps[-1], mass, figures=False)]
+        return [*found, passed_last(task, self.motion, self.steps[-1], mass)]
 
     def acts(self, sets: Sequence[AnyArray]) -> Iterator[Act]:
         """Reports and prices of `sets`, or of sensors that are on with such probabilities."""
         for choice, on in zip(self.choices, sets, strict=True):
-            paid = per_row(choice.rows, self.task.paid[choice.sensors] * on, len(self.plans))
-            yield choice.report(on[:, None])[:, 0], paid[self.owner]
+            paid = per_row(choice.rows, self.task.paid[choice.sensors] * on[:, 0], len(self.plans))
+            yield choice.report(on)[:, 0], paid[self.owner]
 
     def system(
         self, sets: Sequence[AnyArray], *, guessed: bool = False
@@ -144,16 +144,11 @@ class Renewal:
 
         `guessed`: a value near to the policy's is known, so that iteration is faster on a grid of some size.
         """
-        located, gathered = whole_renewals(self.passes(self.acts(sets)), self.count, figures=1)
+        located, gathered = whole_renewals(self.passes(self.acts(sets)), self.count)
         direct = _DIRECT if guessed else DIRECT_CELLS
         tolerance = TOLERANCE if self.single else _SEARCHED
         system = RenewalSystem(located, self.groups, direct=direct, tolerance=tolerance)
         return system, gathered[:, 0]
-
-    def value(self, sets: Sequence[BoolArray], guess: Array | None = None) -> Array:
-        """`[B]` V of a policy; `guess` is where an iteration begins."""
-        system, earned = self.system(sets, guessed=guess is not None)
-        return system.solve(earned, guess)
 
     def problem(
         self, value: Array, weight: Array | None = None, credit: Sequence[Array] | None = None
@@ -218,13 +213,14 @@ class Renewal:
     def sets(self, policy: PolicyTable) -> list[BoolArray]:
         """The sets of a deterministic policy; sensors where the target cannot be are left out."""
         return [
-            policy.chosen(n, self.plans[choice.rows], choice.sensors) > 0
+            policy.chosen(n, self.plans[choice.rows], choice.sensors)[:, None] > 0
             for n, choice in enumerate(self.choices)
         ]
 
     def table(self, sets: Sequence[BoolArray]) -> PolicyTable:
         """The policy of sets; a key that cannot occur has none."""
-        parts = zip(self.choices, sets, strict=True)
+        some = [np.flatnonzero(on) for on in sets]
+        parts = zip(self.choices, some, strict=True)
         return PolicyTable.from_sensed(
             self.task, [(self.plans[choice.rows[on]], choice.sensors[on]) for choice, on in parts]
         )
@@ -247,12 +243,10 @@ def _step_bytes(motion: Motion, choices: int) -> float:
     """About the memory of the entries and moves of one event, from a sample of states."""
     states = motion.num_states
     start = np.unique(np.linspace(0, states - 1, _SAMPLED).astype(np.int64))
-    moves = motion.moves.astype(bool)
-    reached = ones_at(np.arange(len(start)), start, (len(start), states))
-    fan, places, steps = np.diff(moves.indptr), 0, [0]
+    moves, reached = motion.moves.astype(bool), ones_at(start, start, motion.moves.shape)[start]
+    fan, places = moves.nnz / states, [1.0]
     for _ in range(choices + 1):
-        steps.append(int(fan[reached.indices].sum()))
         reached = reached @ moves
-        places += reached.nnz
+        places.append(reached.nnz / len(start))
     # Measured: 64 bytes a place, 12 a move, and 48 more while the last moves are sorted.
-    return (64 * places + 12 * sum(steps) + 48 * steps[-1]) / len(start)
+    return 64 * sum(places[1:]) + fan * (12 * sum(places[:-1]) + 48 * places[-2])

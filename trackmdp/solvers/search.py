@@ -47,7 +47,7 @@ class Found:
 
     Args:
         renewal: the problem.
-        sets: `[G]` bool for each free choice, or the probabilities with which sensors are on.
+        sets: `[G, 1]` bool for each free choice, or the probabilities with which sensors are on.
         near: a policy of about the same value, or such a value `[B]`: where iterations begin.
 
     Attributes:
@@ -163,16 +163,16 @@ def rows_changed(
     """`[K]`, the rows in which the sets differ."""
     found = np.zeros(layout.count, dtype=bool)
     for turn, old, new in zip(layout.turns, before, after, strict=True):
-        found[turn.choice.rows[old != new]] = True
+        found[turn.choice.rows[(old != new)[:, 0]]] = True
     return found
 
 
 def mixed(
     layout: Layout, rows: BoolArray, these: Sequence[BoolArray], others: Sequence[BoolArray]
 ) -> list[BoolArray]:
-    """`[G]` for each free choice: `these` sets in the `rows` `[K]` that are chosen, else the `others`."""
+    """`[G, 1]` for each free choice: `these` sets in the `rows` `[K]` that are chosen, else the `others`."""
     return [
-        np.where(rows[turn.choice.rows], this, other)
+        np.where(rows[turn.choice.rows, None], this, other)
         for turn, this, other in zip(layout.turns, these, others, strict=True)
     ]
 
@@ -190,7 +190,7 @@ def _episodes(policy: Found, plans: Plans) -> Array | float:
     if policy.visits is None:
         return 1.0
     visits = policy.renewal.by_plan(policy.visits)
-    mass = (plans.layout.sums(0) @ plans.mass)[:, 0]
+    mass = (plans.layout.sums[0] @ plans.mass)[:, 0]
     # Visits as solved for may be a rounding below 0.
     return np.where(mass > 1e-12, visits / np.maximum(mass, 1e-12), 0.0)
 
@@ -214,17 +214,7 @@ def clocked_sets(renewal: Renewal) -> list[BoolArray]:
     nothing = np.zeros(renewal.count)
     weight = None if renewal.single else renewal.shares(nothing)
     plans = renewal.problem(nothing, weight, credit_of(renewal.world))
-    return columns_of(plans.ascend(plans.none(), sweeps=1, optimism=1.0))
-
-
-def columns_of(sets: Sequence[BoolArray]) -> list[BoolArray]:
-    """`[G]` of the first candidate."""
-    return [on[:, 0] for on in sets]
-
-
-def candidates_of(sets: Sequence[AnyArray]) -> list[AnyArray]:
-    """`[G, 1]`, one candidate."""
-    return [on[:, None] for on in sets]
+    return plans.ascend(plans.none(), sweeps=1, optimism=1.0)
 
 
 def follow_credit(
@@ -247,9 +237,9 @@ def follow_credit(
         if not go_on():
             return best
         plans = policy.plans(credit, value)
-        sets = plans.ascend(candidates_of(policy.sets), sweeps=sweeps, optimism=1.0 - step / steps)
+        sets = plans.ascend(policy.sets, sweeps=sweeps, optimism=1.0 - step / steps)
         # Each step of the homotopy moves few sets, so that the value before is a good guess.
-        policy = Found(renewal, columns_of(sets), policy if step else value)
+        policy = Found(renewal, sets, policy if step else value)
         value = policy.value
         if renewal.single or policy.aihtr > best.aihtr:
             best = policy
@@ -261,7 +251,7 @@ def ascended(policy: Found, *, go_on: GoOn = always) -> Found:
     exact = False
     while go_on():
         plans = policy.plans()
-        sets = columns_of(plans.ascend(candidates_of(policy.sets), sweeps=10, exact=exact))
+        sets = plans.ascend(policy.sets, sweeps=10, exact=exact)
         better = risen(policy, plans, sets)
         if better is not None:
             policy = better

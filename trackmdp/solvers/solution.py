@@ -119,7 +119,7 @@ def bracketed(
     tolerance: float = 1e-6,
 ) -> Solution:
     """A policy found in another way, in `seconds`, under a proved `bound` `[M]`, by default the clocked one."""
-    evaluation = value_of(world, table, per_cell=False)
+    evaluation = value_of(world, table)
     bound = np.maximum(clocked(world) if bound is None else bound, evaluation.value)
     gap = float((bound - evaluation.value).mean()) + evaluation.error
     certified = gap <= tolerance * max(1.0, abs(evaluation.aihtr))

@@ -254,10 +254,9 @@ def height(slopes: Array, bounds: Array, left: Corner, right: Corner) -> float:
     chord = slope(left, right)
     k, u = slopes - chord, bounds - (left.net - chord * left.sensors)
     rising, falling = k >= 0, k <= 0
-    least = np.full((int(rising.sum()), int(falling.sum())), np.inf)
-    ki, kj = np.meshgrid(k[rising], k[falling], indexing="ij")
-    ui, uj = np.meshgrid(u[rising], u[falling], indexing="ij")
-    np.divide(ki * uj - kj * ui, ki - kj, out=least, where=ki > kj)
+    ki, ui, kj, uj = k[rising, None], u[rising, None], k[falling], u[falling]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        least = np.where(ki > kj, (ki * uj - kj * ui) / (ki - kj), np.inf)
     # a line parallel to the chord meets none of its kind
     flat = u[k == 0]
     return float(min(least.min(initial=np.inf), flat.min(initial=np.inf)))

@@ -27,16 +27,15 @@ from trackmdp.sensing.task import Task
 from trackmdp.solvers.evaluation import Evaluation, ReplayedTracks, by_start, pooled
 from trackmdp.solvers.linear import (
     DIRECT_CELLS,
-    Levels,
     RenewalSystem,
     check_length,
     expected_steps,
+    solve_onward,
     still_to_come,
 )
 from trackmdp.solvers.walk import (
     Events,
     Passed,
-    Under,
     Walk,
     all_events,
     detected_codes,
@@ -59,8 +58,6 @@ def value_of(
     policy: PolicyLike | Array | BoolArray,
     *,
     guess: Array | None = None,
-    per_cell: bool = True,
-    under: Under | None = None,
 ) -> Evaluation:
     """The figures of a policy of one target; `trackmdp.solvers.evaluate` takes names and several targets as well.
 
@@ -69,9 +66,6 @@ def value_of(
         policy: a `Policy` or its table, or the same dense, `[M, t_max + 1, M]`; a TensorDict module or a function
             that does not draw (`Policy.from_function`); a `Run`, a `Solution`, or a model of Stable-Baselines3.
         guess: `[M]`, where the solve begins on a grid too large to factorise, such as the clocked bound.
-        per_cell: whether detections, sensors and safe actions are wanted of each start cell as well, which takes half
-            as long again on a grid too large to factorise (a smaller one has them for nothing).
-        under: finds the events along the held-out tracks (`trackmdp.solvers.reach`); None: they are walked.
 
     Raises:
         UserError: the policy draws at random with unknown probabilities, or is for another grid.
@@ -81,21 +75,16 @@ def value_of(
     if isinstance(problem, Recorded):
         tracks = problem.held_out.limited(problem.max_steps)
         starts = tracks.cells[tracks.first[:-1]]
-        return replay(problem, tracks, table, under).evaluation(starts, problem.num_cells)
+        return replay(problem, tracks, table).evaluation(starts, problem.num_cells)
     if problem.max_steps is not None:
         return truncated_value(problem, table, problem.max_steps)
-    return _whole_episodes(problem, table, guess, per_cell)
+    return _whole_episodes(problem, table, guess)
 
 
-def follow(
-    task: Task, motion: Motion, policy: PolicyTable, under: Under | None = None
-) -> tuple[Events, Iterator[Passed]]:
+def follow(task: Task, motion: Motion, policy: PolicyTable) -> tuple[Events, Iterator[Passed]]:
     """The events that a policy leads to, and their steps: only mass that it leaves undetected is followed."""
     acts = policy.sensed_by(task)
-    if under is None:
-        events = all_events(task, policy.task.keys, motion, acts.reports)
-    else:
-        events = under(acts.reports)
+    events = all_events(task, policy.task.keys, motion, acts.reports)
     return events, _steps(task, motion, events, acts)
 
 
@@ -155,14 +144,12 @@ def _by_length(events: Events, found: Iterable[Passed]) -> list[tuple[sparse.csr
     return steps
 
 
-def _whole_episodes(
-    world: World, policy: PolicyTable, guess: Array | None, per_cell: bool
-) -> Evaluation:
+def _whole_episodes(world: World, policy: PolicyTable, guess: Array | None) -> Evaluation:
     events, steps = follow(world, world.motion, policy)
     located, gathered = whole_renewals(steps, len(events.codes))
     cells_alone = events.keys.num_classes == world.modes == 1
     if cells_alone and len(events.codes) > DIRECT_CELLS:
-        return _iterated(world, located, gathered, guess, per_cell)
+        return _iterated(world, located, gathered, guess)
     size = world.size if cells_alone else event_groups(world.motion, events.state)
     system = RenewalSystem(located, size)
     totals = system.solve(gathered)
@@ -171,11 +158,9 @@ def _whole_episodes(
     return _figures(world, events, totals, error)
 
 
-def whole_renewals(
-    steps: Iterable[Passed], count: int, figures: int = 6
-) -> tuple[sparse.csr_array, Array]:
-    """K `[B, B]` and the totals of whole renewals, `[B, figures]` as those of the steps."""
-    located, gathered = sparse.csr_array((count, count)), np.zeros((figures, count)).T
+def whole_renewals(steps: Iterable[Passed], count: int) -> tuple[sparse.csr_array, Array]:
+    """K `[B, B]` and the totals of whole renewals, `[B, 6]` as those of the steps."""
+    located, gathered = sparse.csr_array((count, count)), np.zeros((6, count)).T
     for step in steps:
         located = located + step.located
         gathered += step.totals
@@ -188,7 +173,6 @@ def _iterated(
     located: sparse.csr_array,
     gathered: Array,
     guess: Array | None,
-    per_cell: bool,
 ) -> Evaluation:
     """The figures on a large grid: by iteration, the value and the pooled figures by two solves in place of six."""
     m, states = world.num_cells, len(gathered)
@@ -199,8 +183,6 @@ def _iterated(
     error = system.error(gathered[:, 0], value, float(length.max()))
     # Sensing does not move the target, and each episode has one exit step: the steps in the grid are all but that one.
     steps = length - 1.0
-    if per_cell:
-        return pooled([value[:m], steps, *system.solve(gathered[:, 2:5])[:m].T, length], error)
     # Detections and the like are wanted for a uniform start s alone, s (I - T)^-1 b: with the visits v = s (I - T)^-1,
     # that is v = s + v T, each is a scalar product v b. One system goes before the next comes: both are large.
     del system
@@ -272,22 +254,20 @@ def price_at_exit(world: World, policy: PolicyTable) -> float:
     return float(RenewalSystem(located, world.size).solve(paid).mean())
 
 
-def replay(
-    task: Task, tracks: Tracks, policy: PolicyTable, under: Under | None = None
-) -> ReplayedTracks:
+def replay(task: Task, tracks: Tracks, policy: PolicyTable) -> ReplayedTracks:
     """Follow `policy` along every recorded track, from its first cell.
 
     A renewal leads to later points of its track alone.
     """
     motion = tracks.motion()
-    events, found = follow(task, motion, policy, under)
+    events, found = follow(task, motion, policy)
     steps, count = list(found), len(events.codes)
     located, gathered = whole_renewals(steps, count)
-    levels = Levels(tracks.places[events.state])
-    totals = levels.solve(located, gathered)
+    place = tracks.places[events.state]
+    totals = solve_onward(place, located, gathered)
     first = first_events(events, motion)
     start = np.bincount(first, minlength=count).astype(np.float64)
-    visits = levels.solve(located, start, transposed=True)
+    visits = solve_onward(place, located, start, transposed=True)
     # How often each row of the policy's table was used, key by key and n by n.
     used = np.zeros((policy.task.num_keys, task.num_choices))
     for n, step in enumerate(steps[:-1]):

@@ -89,7 +89,10 @@ def _processes(workers: int) -> Iterator[Crew]:
         results: dict[int, Result] = {}
         for _ in range(_ATTEMPTS):
             left = [number for number in range(len(jobs)) if number not in results]
-            futures = {number: _submit(pool, work, jobs[number]) for number in left}
+            futures = dict[int, Future[Result]]()
+            for number in left:
+                with _starting():
+                    futures[number] = pool.submit(_done, work, jobs[number])
             for number, future in futures.items():
                 # a worker died: all unfinished jobs are run again
                 with suppress(BrokenProcessPool):
@@ -120,13 +123,6 @@ def _pool(workers: int) -> ProcessPoolExecutor:
     with _starting():
         # Spawned, not forked: a fork copies locks that another thread of this process may hold.
         return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), end_with_parent)
-
-
-def _submit(
-    pool: ProcessPoolExecutor, work: Callable[[Piece], Result], job: Piece
-) -> Future[Result]:
-    with _starting():
-        return pool.submit(_done, work, job)
 
 
 @contextmanager

@@ -146,7 +146,7 @@ def compare(problem: Subject, policies: Mapping[str, Any] | Sequence[Any]) -> Co
     tables = _made(problem, named, partial(_table, problem))
     if problem.recorded is not None:
         return _on_tracks(problem.recorded, tables)
-    found = {name: value_of(problem, table, per_cell=False) for name, table in tables.items()}
+    found = {name: value_of(problem, table) for name, table in tables.items()}
     first, *_ = found.values()
     rows = (
         Compared(

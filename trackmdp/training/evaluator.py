@@ -18,7 +18,6 @@ from trackmdp.sensing.task import Task
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluation import Evaluation, ReplayedTracks, regret_per_step
 from trackmdp.solvers.hidden import averaged
-from trackmdp.solvers.reach import Replays
 from trackmdp.solvers.value import replay, value_of
 from trackmdp.world.model import World
 from trackmdp.world.problem import Problem
@@ -77,7 +76,7 @@ class Evaluator:
 
     def evaluate(self, policy: PolicyTable) -> Evaluation:
         """Figures of a policy: exact, or those on the held-out tracks."""
-        return value_of(self.world, policy, per_cell=False)
+        return value_of(self.world, policy)
 
     def score(self, policy: PolicyTable) -> Score:
         """Figures and the regret per step, by which a policy may be chosen: while learning, for best.pt."""
@@ -136,11 +135,10 @@ class HeldOutEvaluator(Evaluator):
     def __init__(self, world: Recorded) -> None:
         super().__init__(world)
         self.tracks = world.held_out.limited(world.max_steps)
-        self._validation = Replays(world.selection)
 
     def score(self, policy: PolicyTable) -> Score:
         """Figures of a policy on the validation tracks."""
-        return Score(self._validation.value(policy), math.nan, math.nan)
+        return Score(value_of(self.world.selection, policy), math.nan, math.nan)
 
     def replayed(self, policy: PolicyTable) -> ReplayedTracks:
         """The totals of a policy on the held-out tracks."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Mapping, Sequence
 from inspect import signature
 from pathlib import Path
@@ -22,7 +23,6 @@ from trackmdp.config.sensors import lattice
 from trackmdp.errors import UserError
 from trackmdp.grid.place import Place
 from trackmdp.grid.size import TASK_BYTES, Size, check_fits, grid_size
-from trackmdp.motion.kernel_checks import canonical_kernel, check_kernel
 from trackmdp.recordings.track_files import read_track_file
 from trackmdp.recordings.tracks import Recorded
 from trackmdp.sensing.coverage import Coverage, discs
@@ -224,17 +224,16 @@ def build_world(cfg: WorldConfig) -> World:
     Raises:
         UserError: a file is missing or malformed, or the kernel breaks a rule (`motion/kernel_checks.py`).
     """
-    (rows, columns), source, modes = cfg.grid.sides, cfg.kernel.source, {}
     own = {name: getattr(cfg.kernel, name) for name in options(type(cfg.kernel))}
-    reveals = own.pop("reveals", False)
+    modes = {"reveals": own.pop("reveals", False)}
     made = maker(cfg.kernel)(cfg.grid.size, **own)
     if cfg.kernel.hides:
-        made, count = made
-        modes, columns = {"modes": count, "reveals": reveals}, columns * count
-    # `World` checks again; here the message names the option at fault (`source`).
-    kernel = canonical_kernel(made, source)
-    check_kernel(kernel, (rows, columns), truncates=cfg.grid.max_steps is not None, source=source)
-    return World(kernel, cfg.grid.sides, **of_task(cfg), **modes)
+        made, modes["modes"] = made
+    task = of_task(cfg)
+    try:
+        return World(made, cfg.grid.sides, **task, **modes)
+    except UserError as error:  # with the option at fault
+        raise UserError(re.sub("^kernel(?=:)", lambda _: cfg.kernel.source, str(error))) from None
 
 
 def recorded(

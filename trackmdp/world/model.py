@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from trackmdp.arrays.entries import row_sums
 from trackmdp.arrays.numbers import whole_number
-from trackmdp.arrays.rows import pairwise_row_sums
 from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError
 from trackmdp.grid.displacements import displacement
@@ -135,8 +135,7 @@ class World(Task):
     @cached_property
     def stay_probability(self) -> Array:
         """`[Z]` probability of still being in the grid after one step, 1 - p_exit."""
-        # Not kernel.sum(axis=1), which may differ in the last digit from the sums of the same kernel written out.
-        return pairwise_row_sums(self.kernel)
+        return row_sums(self.kernel)
 
 
 def motion_words(kernel: sparse.csr_array, state: str) -> str:

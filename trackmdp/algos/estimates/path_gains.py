@@ -20,7 +20,7 @@ from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.policies.table import SetTable
 from trackmdp.recordings.tracks import Tracks
 from trackmdp.sensing.task import Task
-from trackmdp.solvers.linear import Levels
+from trackmdp.solvers.linear import solve_onward
 from trackmdp.solvers.renewal import Act, Renewal
 from trackmdp.solvers.walk import Passed, all_events
 
@@ -49,7 +49,7 @@ class AlongPaths:
         """`[B]` V, discounted, times γ."""
         located = sum((step.located for step in self.steps[1:]), self.steps[0].located)
         earned = np.sum([step.totals[:, 0] for step in self.steps], axis=0)
-        return self.paths.levels.solve(located, earned)
+        return solve_onward(self.paths.places, located, earned)
 
     @cached_property
     def gain(self) -> list[Array]:
@@ -82,7 +82,7 @@ class Paths:
         copies: tracks for each that differs.
         moves: on all of the tracks.
         discount: γ.
-        levels: of the events, whose places in their paths these are.
+        places: `[B]`, of the events in their paths.
     """
 
     def __init__(self, task: Task, tracks: Tracks, discount: float) -> None:
@@ -93,7 +93,7 @@ class Paths:
         of_point = np.repeat(times, tracks.lengths).astype(np.float64)
         self.times = of_point[self.renewal.states]
         self.copies = float(times.mean())
-        self.levels = Levels(tracks.places[self.renewal.states])
+        self.places = tracks.places[self.renewal.states]
         self._starts = np.bincount(self.renewal.first, minlength=self.renewal.count).astype(float)
 
     @property
@@ -116,7 +116,7 @@ class Paths:
             with_data(step.located, step.located.data * factor[row_index(step.located)])
             for step, factor in zip(steps, factors, strict=True)
         )
-        visits = self.levels.solve(plain, self._starts, transposed=True)
+        visits = solve_onward(self.places, plain, self._starts, transposed=True)
         reward = sum(
             float(visits @ (self.times * factor * step.totals[:, 0]))
             for step, factor in zip(steps, factors, strict=True)

@@ -24,7 +24,6 @@ from trackmdp.seeding import derive
 from trackmdp.sensing.task import Task
 from trackmdp.solvers.exchange import exchange
 from trackmdp.solvers.plans import Plans
-from trackmdp.solvers.search import candidates_of, columns_of
 
 PRIORS = (1.0, 3.0, 10.0, 30.0, 100.0)
 """Weights of the prior mean that are tried."""
@@ -195,8 +194,11 @@ def exchanged_keys(
     plans, sets = _trees(paths, followed, often), table.sets
     assert sets is not None
     choices = [turn.choice for turn in plans.turns]
-    before = [table.chosen(n, often[each.rows], each.sensors) > 0 for n, each in enumerate(choices)]
-    ascended = columns_of(plans.ascend(candidates_of(before), sweeps=2))
+    before = [
+        table.chosen(n, often[each.rows], each.sensors)[:, None] > 0
+        for n, each in enumerate(choices)
+    ]
+    ascended = plans.ascend(before, sweeps=2)
     found = exchange(plans, ascended, np.ones(len(often), dtype=bool))
     worth, other = (plans.worth_of(each) for each in (before, found))
     gain = other - worth
@@ -209,7 +211,7 @@ def exchanged_keys(
         kept = stays[row_index(sets) // len(choices)]
         rows, sensors = [row_index(sets)[kept]], [sets.indices[kept]]
         for n, (each, on) in enumerate(zip(choices, found, strict=True)):
-            new = on & ~few[each.rows]
+            new = on[:, 0] & ~few[each.rows]
             rows.append(often[each.rows[new]] * len(choices) + n)
             sensors.append(each.sensors[new])
         after = ones_at(np.concatenate(rows), np.concatenate(sensors), sets.shape)

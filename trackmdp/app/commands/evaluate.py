@@ -145,7 +145,7 @@ def _several(
     if rule.tables:  # else it was learned for all targets together
         # On recorded tracks each is in one of the groups, some of which have fewer targets.
         each = len(group) if recorded is None else len(recorded.held_out) / len(found.totals)
-        apart = each * evaluate(group.single, policy, per_cell=False).aihtr
+        apart = each * evaluate(group.single, policy).aihtr
     report = {"policy": subject, "targets": len(group), "merge": rule.name, **found.report()}
     write_json(folder / "evaluation.json", report | {"apart": apart, "upper": upper})
     rows = [

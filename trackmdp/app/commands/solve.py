@@ -158,9 +158,7 @@ def _on_average(
         return
     found = trace(world, cfg.solver, 1e-3, near=most)
     mixture = found.at(sensors=most)
-    values = (
-        (weight, value_of(world, each.table, per_cell=False)) for weight, each in mixture.parts
-    )
+    values = ((weight, value_of(world, each.table)) for weight, each in mixture.parts)
     value = sum(weight * each.aihtr for weight, each in values)
     upper = max(value, found.worth(most, price))
     own = {"sensors": most, "binding": True, "lower": value, "upper": upper}

@@ -39,9 +39,9 @@ class Frontier:
     count: IndexArray
     rest: Array
     before: sparse.csr_array
-    missed: sparse.csr_array | None
-    after: Next | None
     origin: Origin | None
+    missed: sparse.csr_array | None = None
+    after: Next | None = None
 
     @classmethod
     def of(
@@ -58,32 +58,25 @@ class Frontier:
         """The states `kept`, with the entries of `moved` of positive `regret`, the likeliest first."""
         # The entries of `moved` are a ragged table: row s has count[s] of them. They are set into rectangles [B, K];
         # the column of an entry is its number within its row: rows (0, 0, 2) have columns (0, 1, 0).
-        # place[s] is the row of state s in the new batch, -1 for one that is not kept.
-        place = np.full(len(start), -1)
-        place[kept] = np.arange(len(kept))
-        rows = place[row_index(moved)]
+        # number[s] is the row of state s in the new batch, -1 for one that is not kept.
+        number = np.full(len(start), -1)
+        number[kept] = np.arange(len(kept))
+        rows = number[row_index(moved)]
         entry = np.flatnonzero((regret > 0) & (rows >= 0))
         # a cell without positive regret is sensed in every choice; there is nothing to decide
         entry = entry[np.lexsort((-moved.data[entry], rows[entry]))]
         count = np.bincount(rows[entry], minlength=len(kept))
-        column = ranks(rows[entry])
         shape = (len(kept), int(count.max(initial=0)))
         cells, mass, loss = np.zeros(shape, dtype=np.intp), np.zeros(shape), np.zeros(shape)
-        cells[rows[entry], column] = moved.indices[entry]
-        mass[rows[entry], column] = moved.data[entry]
-        loss[rows[entry], column] = regret[entry]
-        source = None if origin is None else origin.pick(kept)
-        states = (
-            start[kept],
-            sets_left,
-            relaxed[kept],
-            cells,
-            mass,
-            loss,
-            count,
-            np.zeros((shape[0], shape[1] + 1)),
+        place = rows[entry], ranks(rows[entry])
+        cells[place], mass[place], loss[place] = (
+            moved.indices[entry],
+            moved.data[entry],
+            regret[entry],
         )
-        return cls(*states, before[kept], None, None, source)
+        rest, source = np.zeros((shape[0], shape[1] + 1)), origin and origin.pick(kept)
+        at_start = start[kept], sets_left, relaxed[kept]
+        return cls(*at_start, cells, mass, loss, count, rest, before[kept], source)
 
 
 @dataclass(frozen=True)
@@ -139,12 +132,8 @@ class Origin:
     @classmethod
     def of(cls, batches: list[Choices]) -> Origin:
         """One state per choice, in order: batches of 2 and 3 rows have batch 0 0 1 1 1 and place 0 1 0 1 2."""
-        sizes = [len(each.state) for each in batches]
-        return cls(
-            batches,
-            np.repeat(np.arange(len(sizes)), sizes),
-            np.concatenate([np.arange(n) for n in sizes]),
-        )
+        batch = np.repeat(np.arange(len(batches)), [len(each.state) for each in batches])
+        return cls(batches, batch, ranks(batch))
 
     def pick(self, kept: IndexArray) -> Origin:
         """Where the states `kept` came from."""

@@ -80,5 +80,5 @@ class InnerProblem:
         return Plans(layout, weight, detected, self.missed[steps[-1].states], credit)
 
     def worth(self, sets: list[BoolArray], mass: Array | None = None) -> Array:
-        """`[M]`, worth of the plans `sets` `[G]` from each located cell."""
+        """`[M]`, worth of the plans `sets` `[G, 1]` from each located cell."""
         return self.plans(mass).worth_of(sets)

@@ -12,7 +12,6 @@ from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.solvers.certify.branch import Tree
 from trackmdp.solvers.certify.delayed import Delayed
 from trackmdp.solvers.certify.inner import InnerProblem
-from trackmdp.solvers.search import columns_of
 
 
 def first_guess(
@@ -25,7 +24,7 @@ def first_guess(
     sets = plans.none()
     for optimism in np.linspace(1.0, 0.0, 11):
         sets = plans.ascend(sets, sweeps=3, optimism=float(optimism))
-    return columns_of(sets)
+    return sets
 
 
 def tables(
@@ -71,7 +70,7 @@ def planted(
 def adopted(
     problem: InnerProblem, sets: list[BoolArray], tree: Tree, mass: Array | None = None
 ) -> list[BoolArray] | None:
-    """`sets` `[G]` with the better plans that a tree has found, from `mass` `[E]`; None if there are none.
+    """`sets` `[G, 1]` with the better plans that a tree has found, from `mass` `[E]`; None if there are none.
 
     Without a `mass` it is 1 in each located cell.
     """
@@ -83,8 +82,9 @@ def adopted(
         mass = mass @ turn.moves
         # A plan of the tree senses every possible cell but those left out.
         rows, cells = turn.choice.rows, turn.choice.sensors
-        found.append(np.where(better[rows], (mass > 0) & ~out.has(rows, cells), on))
-        mass = mass * (1.0 - turn.choice.report(found[-1][:, None])[:, 0])
+        sensed = (mass > 0) & ~out.has(rows, cells)
+        found.append(np.where(better[rows, None], sensed[:, None], on))
+        mass = mass * (1.0 - turn.choice.report(found[-1])[:, 0])
     return found
 
 

@@ -37,14 +37,14 @@ def best_plans(
 
     Args:
         plans: with mass 1 in each row.
-        sets: `[G]` for each step, the plans at hand.
+        sets: `[G, 1]` for each step, the plans at hand.
         slack: plans better by less are not looked for.
         revealed: `[E]`, after the last but one step: worth of one more set with the state known.
         go_on: takes the number of plans looked at since it was asked last; whether to go on.
 
     Returns:
-        `[K]` proved: no plan is worth more; and `[G]` for each step, the plans at hand or better ones. None where there
-        are too many choices, or `go_on` ended the listing.
+        `[K]` proved: no plan is worth more; and `[G, 1]` for each step, the plans at hand or better ones. None where
+        there are too many choices, or `go_on` ended the listing.
     """
     first = _choices(plans)
     if first is None:
@@ -54,7 +54,7 @@ def best_plans(
     for number in range(first.count):
         tried = first.of(number)
         earned, mass = _earned(plans, tried)
-        hopeful = earned + plans.layout.sums(plans.length - 1) @ (mass * revealed) > most
+        hopeful = earned + plans.layout.sums[plans.length - 1] @ (mass * revealed) > most
         if not hopeful.any():
             continue
         if not go_on(int(hopeful.sum())):
@@ -76,7 +76,7 @@ class _Choices:
     Attributes:
         count: of them.
         of: the choice of a number.
-        sets: from the number of each row `[K]`, -1 for none, to the sets `[G]` of each listed step.
+        sets: from the number of each row `[K]`, -1 for none, to the sets `[G, 1]` of each listed step.
     """
 
     count: int
@@ -108,16 +108,16 @@ def _of_sensors(plans: Plans) -> _Choices | None:
     def sets(numbers: IndexArray) -> list[BoolArray]:
         found = []
         for t, turn in enumerate(plans.turns[:-1]):
-            on = bits(t, numbers[turn.choice.rows]) & 1 > 0
+            on = (bits(t, numbers[turn.choice.rows]) & 1 > 0)[:, None]
             allowed = turn.choice.allowed
-            found.append(on if allowed is None else on & allowed[:, 0])
+            found.append(on if allowed is None else on & allowed)
         return found
 
     def of(number: int) -> _Tried:
         report, price = [], []
         for t, on in enumerate(sets(np.full(plans.layout.count, number)), start=1):
-            report.append(plans.turns[t - 1].choice.report(on[:, None])[:, 0])
-            price.append(plans.layout.pay(t) @ on)
+            report.append(plans.turns[t - 1].choice.report(on)[:, 0])
+            price.append((plans.layout.pay[t - 1] @ on)[:, 0])
         return report, price
 
     return _Choices(count, of, sets)
@@ -182,8 +182,8 @@ def _of_patterns(plans: Plans, choice: Shared) -> _Choices | None:
         of_entry = numbers[turn.rows]
         wanted = (of_entry >> number) & 1 > 0
         large = (1.0 + turn.price.sum()) * (of_entry >= 0)
-        on: BoolArray = choice.cover(np.where(wanted, large, -large), turn.price, exact=True).on > 0
-        return [on]
+        found = choice.cover(np.where(wanted, large, -large), turn.price, exact=True)
+        return [found.on[:, None] > 0]
 
     return _Choices(2**bits, of, sets)
 
@@ -211,7 +211,7 @@ def _earned(plans: Plans, tried: _Tried) -> tuple[Array, Array]:
     earned, mass = np.zeros(plans.layout.count), plans.mass[:, 0]
     for t, (report, price) in enumerate(zip(*tried, strict=True), start=1):
         now = plans.turns[t - 1].back @ mass
-        sums = plans.layout.sums(t)
+        sums = plans.layout.sums[t]
         inside = sums @ now
         paid = np.where(inside > 0, price, 0.0) * inside  # an impossible set costs inf
         earned += sums @ (now * report * plans.detected[t - 1][:, 0]) - paid
@@ -226,7 +226,7 @@ def _last(plans: Plans, mass: Array, hopeful: BoolArray) -> Array:
     missed = plans.missed[:, 0]
     gain = now * (plans.detected[t - 1][:, 0] - missed)
     price = plans.priced(t, now[:, None])[:, 0]
-    most: Array = plans.layout.sums(t) @ (now * missed)
+    most: Array = plans.layout.sums[t] @ (now * missed)
     return most + turn.choice.upper(gain, price)
 
 
@@ -234,12 +234,13 @@ def _plans_of(
     plans: Plans, sets: list[BoolArray], first: _Choices, best: IndexArray
 ) -> list[BoolArray]:
     """The plans of the best choices, in the rows that have one."""
-    new = [on[:, None] for on in first.sets(best)]
-    for old, on, turn in zip(sets, new, plans.turns, strict=False):
-        on[:, 0] = np.where(best[turn.choice.rows] >= 0, on[:, 0], old)
+    found = best[:, None] >= 0
+    new = [
+        np.where(found[turn.choice.rows], on, old)
+        for turn, on, old in zip(plans.turns, first.sets(best), sets, strict=False)
+    ]
     turn, t = plans.turns[-1], plans.length
     now = plans.pushed(new, t)
     gain = now * (plans.detected[t - 1] - plans.missed)
-    last = turn.choice.best(gain, plans.priced(t, now), sets[-1][:, None], exact=True)
-    better = best[turn.choice.rows] >= 0
-    return [*(on[:, 0] for on in new), np.where(better, last[:, 0], sets[-1])]
+    last = turn.choice.best(gain, plans.priced(t, now), sets[-1], exact=True)
+    return [*new, np.where(found[turn.choice.rows], last, sets[-1])]

@@ -217,10 +217,11 @@ class Merged(Rule):
         for kind, (world, table) in enumerate(zip(self.group.kinds, self.tables, strict=True)):
             renewal = Renewal(world, world.motion)
             sets = renewal.sets(table)
-            value = renewal.value(sets)
+            system, earned = renewal.system(sets)
+            value = system.solve(earned)
             # Behind the cells stand those in which the safe action has missed, if it does.
             values.append(value[: self.cells])
-            after = renewal.problem(value).after([on[:, None] for on in sets])
+            after = renewal.problem(value).after(sets)
             for step, worth, (codes, found) in zip(renewal.steps, after, worths, strict=False):
                 located, state = step.rows + kind * self.cells, step.states + kind * self.cells
                 codes.append(located.astype(np.int64) * states + state)
