@@ -23,7 +23,7 @@ from tensordict.nn import (
 )
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.data.replay_buffers.samplers import RandomSampler, Sampler
+from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 from torchrl.objectives import LossModule, SoftUpdate
 
@@ -184,11 +184,9 @@ class DQN(Checkpointed):
         self.parameters = list(qvalue.parameters())
         self.optimizer = torch.optim.Adam(self.parameters, lr=cfg.learning_rate.start, fused=True)
         per = cfg.prioritized
-        sampler = (
-            PrioritizedSampler(cfg.buffer_size, per.alpha, per.beta, device)
-            if per.enabled
-            else RandomSampler()
-        )
+        sampler = None  # as likely each
+        if per.enabled:
+            sampler = PrioritizedSampler(cfg.buffer_size, per.alpha, per.beta, device)
         self.buffer = TensorDictReplayBuffer(
             storage=_ZeroedStorage(cfg.buffer_size, device=device),
             sampler=sampler,

@@ -187,8 +187,8 @@ class ModelBased(Checkpointed):
             paths = Paths(task, some, cfg.gamma)
             prior = UNJUDGED * paths.copies if cfg.prior is None else cfg.prior
             found = plan_paths(paths, prior=prior, rounds=cfg.rounds)
-        reward = found.reward / max(found.moves, 1)
-        self._found = {"keys_seen": float(found.seen), "reward_per_move": reward}
+        reward, seen = found.reward / max(found.paths.moves, 1), len(found.paths.keys)
+        self._found = {"keys_seen": float(seen), "reward_per_move": reward}
         return found.policy
 
     def _pooled(self, tracks: Tracks, _: PolicyTable | None) -> PolicyTable:

@@ -116,7 +116,7 @@ def test_memory_is_worth_what_the_zigzag_says() -> None:
         found = planned(task, task.tracks, prior=0.0, rounds=5)
         known[memory] = evaluate(task, found.policy).aihtr
         assert known[memory] == pytest.approx(found.reward / 20)
-        assert found.moves == 20 * 12
+        assert found.paths.moves == 20 * 12
     # The very first move, from cell 0, is known to all.
     assert known["displacement"] == pytest.approx(12 * 0.8)
     assert known["cell"] == pytest.approx(4 * 0.8 + 8 * 0.6)

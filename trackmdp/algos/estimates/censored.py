@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.entries import block_rows, row_index
+from trackmdp.arrays.entries import block_rows, ones_at, row_index
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 
 _AT_ONCE = 2**14
@@ -107,7 +107,7 @@ def expected_moves(
         weight = copies[part] / np.maximum(forward[n].multiply(later).sum(axis=1), 1e-300)
         if ends:
             # The last move ends in the known cell, or in the exit, column M: f_n(i) at (i, end), weighted.
-            last = counted(each, some.end, weight, (len(part), m + 1))
+            last = sparse.csr_array((weight, (each, some.end)), shape=(len(part), m + 1))
             made = made + _pairs(forward[n], last, possible)
         for t in range(n - 1, -1, -1):
             later = _hidden(later, sensed[t])
@@ -176,7 +176,7 @@ def _forward(
     """`[K, M]` undetected mass of each path, at its start and after each set."""
     count = len(paths.start)
     shape = (count, moves.shape[0])
-    mass = [counted(np.arange(count), paths.start, np.ones(count), shape)]
+    mass = [ones_at(np.arange(count), paths.start, shape, np.float64)]
     for each in sensed:
         mass.append(_hidden(mass[-1] @ moves, each))
     return mass
@@ -225,10 +225,3 @@ def _hidden(mass: sparse.csr_array, sensed: sparse.csr_array) -> sparse.csr_arra
     left = mass - mass.multiply(sensed)
     left.eliminate_zeros()
     return left
-
-
-def counted(
-    start: IndexArray, end: IndexArray, weight: Array, shape: tuple[int, int]
-) -> sparse.csr_array:
-    """Sums of `weight` over equal (start, end)."""
-    return sparse.csr_array((weight, (start, end)), shape=shape)

@@ -18,7 +18,7 @@ from scipy import sparse
 
 from trackmdp.algos.common import arrays, tensors
 from trackmdp.algos.estimates.alike import AlikeCells
-from trackmdp.algos.estimates.censored import ObservedPaths, counted, each_once, expected_moves
+from trackmdp.algos.estimates.censored import ObservedPaths, each_once, expected_moves
 from trackmdp.algos.estimates.shrinkage import posterior_mean, unseen
 from trackmdp.arrays.entries import ones_at, per_row, row_index, with_data
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
@@ -136,15 +136,12 @@ class KernelEstimate:
             return
         # Policies repeat themselves: equal paths have equal expectations, and are worked out once.
         paths, copies = each_once(ObservedPaths.of(self._censored, self.num_cells))
-        for first in [True, *[False] * (rounds - 1)]:
-            kernel = (
-                (1.0 - _OPEN) * self.mean() + _OPEN * self._open_moves(paths)
-                if first
-                else self.mean()
-            )
+        kernel = (1.0 - _OPEN) * self.mean() + _OPEN * self._open_moves(paths)
+        for _ in range(rounds):
             before, self.counts = self.counts, self.direct + expected_moves(kernel, paths, copies)
             if abs(self.counts - before).sum() < _SETTLED * self.counts.sum():
                 break
+            kernel = self.mean()
         counts = self.counts.copy()
         counts.data[counts.data < NEGLIGIBLE] = 0.0
         counts.eliminate_zeros()
@@ -325,7 +322,8 @@ class KernelEstimate:
                 inside &= cells % self._modes == begin
             # [cells, S] in row-major order, as `end` below lists its entries.
             start, which = np.nonzero(inside)
-            parts.append(counted(start, end[inside], weight[which], (len(cells), self.num_cells)))
+            place, shape = (start, end[inside]), (len(cells), self.num_cells)
+            parts.append(sparse.csr_array((weight[which], place), shape=shape))
         return sparse.vstack(parts, format="csr")
 
     def _farthest(self, moved: sparse.csr_array) -> int:

@@ -45,14 +45,12 @@ class Planned:
     Attributes:
         plans: a set for every key and n.
         reward: of all paths together.
-        moves: on them.
-        seen: keys that some path may lead to.
+        paths: those.
     """
 
     plans: KeyPlans
     reward: float
-    moves: int
-    seen: int
+    paths: Paths
 
     @cached_property
     def policy(self) -> PolicyTable:
@@ -133,7 +131,7 @@ def plan_paths(
         if after.reward <= value.reward:
             break
         plans, value = tried.plans, after
-    return Planned(plans(), value.reward, paths.moves, len(paths.keys))
+    return Planned(plans(), value.reward, paths)
 
 
 class _View:

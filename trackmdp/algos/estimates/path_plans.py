@@ -87,7 +87,7 @@ def choose_plan(
     better = [_improved(paths, weights[place], rounds, tried[place]) for place in order]
     after = _earned(judged, [each.plans for each in better])
     near = _near(after)
-    first, found, most = _first(judged, [_searched(paths, better[number]) for number in near])
+    first, found, most = _first(judged, [_searched(better[number]) for number in near])
     plans = [tried[place] for place in order] + [each.plans for each in (*better, found)]
     best = int(np.argmax([*earned[order], *after, most]))
     if counted is tracks or enough is not counted:  # of more paths there were enough already
@@ -99,7 +99,7 @@ def choose_plan(
         again = _made(others[place - len(priors)], tracks, whole, plans[best].policy())
         return _valued(whole, again)
     last = _improved(whole, weights[place], rounds, plans[best])  # from the plan that was chosen
-    return _searched(whole, last) if stage == 2 else last
+    return _searched(last) if stage == 2 else last
 
 
 def _unjudged(paths: Paths, tracks: Tracks, start: Maker | None, rounds: int) -> Planned:
@@ -143,7 +143,7 @@ def _first(judged: Paths, searched: Sequence[Planned]) -> tuple[int, Planned, fl
 
 def _valued(paths: Paths, plans: KeyPlans) -> Planned:
     """Plans with their reward on paths."""
-    return Planned(plans, along(paths, plans).reward, paths.moves, len(paths.keys))
+    return Planned(plans, along(paths, plans).reward, paths)
 
 
 def parted(tracks: Tracks, seed: int) -> tuple[Tracks, Tracks]:
@@ -153,9 +153,10 @@ def parted(tracks: Tracks, seed: int) -> tuple[Tracks, Tracks]:
     return tracks.select(~judges), tracks.select(judges)
 
 
-def _searched(paths: Paths, plan: Planned) -> Planned:
+def _searched(plan: Planned) -> Planned:
     """Rounds of exchange from `plan`; where one raises no reward, half as many keys change, those of largest gain."""
-    share, followed = 1.0, along(paths, plan.plans)
+    share, paths = 1.0, plan.paths
+    followed = along(paths, plan.plans)
     found = exchanged_keys(paths, plan.plans.table, followed, _LEAST)
     for _ in range(_ROUNDS):
         if found is None:  # no key comes so often
