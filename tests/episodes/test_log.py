@@ -212,8 +212,8 @@ def test_a_policy_of_any_kind_is_read_back_and_acts_again(tmp_path: Path, acting
         reader.check_all()
         assert np.array_equal(reader.world().kernel.toarray(), WORLD.kernel.toarray())
         found = reader.policy(0)
-        assert (found.probability, found.k) == (acting.probability, acting.k)
-        assert found.sets is None or np.array_equal(found.sets.toarray(), acting.sets.toarray())
+        assert (found.alike, found.k) == (acting.alike, acting.k)
+        assert np.array_equal(found.sets.toarray(), acting.sets.toarray())
         assert verify(reader).difference is None
     assert recover(file).file.read_bytes() == file.read_bytes()
 

@@ -193,7 +193,6 @@ def exchanged_keys(
     if not len(often):
         return None
     plans, sets = _trees(paths, followed, often), table.sets
-    assert sets is not None
     choices = [turn.choice for turn in plans.turns]
     before = [
         table.chosen(n, often[each.rows], each.sensors)[:, None] > 0
