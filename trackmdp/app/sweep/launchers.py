@@ -17,7 +17,6 @@ from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.process import fail, run_job, stop_signal
 from trackmdp.cluster import joining, ray_options
 from trackmdp.config import TrainConfig, sweeping
-from trackmdp.errors import FAILED
 from trackmdp.signals import handled
 
 # Each names the threads of one library (OpenMP, OpenBLAS, MKL), which by default take all cores, in every run at once.
@@ -103,7 +102,7 @@ class Submission:
             run_job(job)
         except UncompletedJobError as error:  # raised by the scheduler's signal
             process.stop_all()
-            fail(job, process.Outcome(FAILED, reason=f"stopped by the scheduler: {error}"))
+            fail(job, f"stopped by the scheduler: {error}")
 
     def checkpoint(self, job: Job) -> Any:
         """Let the run save, and return the next submission."""

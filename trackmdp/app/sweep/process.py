@@ -14,7 +14,6 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -28,6 +27,7 @@ from trackmdp.errors import FAILED, USER_MISTAKE, Preempted, RunError, UserError
 from trackmdp.signals import handled
 from trackmdp.solvers.workers import end_with_parent
 from trackmdp.training.folders import DONE, FAILED_FILE, SUMMARY, run_of
+from trackmdp.untrusted import reason
 
 Launch = Callable[[Sequence[Job]], None]
 """Runs jobs, and returns once none of them is running."""
@@ -52,25 +52,11 @@ _LOST = 255
 _TERMINATING = (signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """How a run ended.
+def run_in_process(job: Job, stop: Callable[[], int]) -> int:
+    """Run `job` in a child process and wait for it; returns its exit status, -N where signal N killed it.
 
-    Attributes:
-        status: as of the command line: 0, 1, 2, or 128 + the signal that stopped it.
-        value: the command's result.
-        reason: why it failed.
-    """
-
-    status: int
-    value: float | None = None
-    reason: str = ""
-
-
-def run_in_process(job: Job, stop: Callable[[], int]) -> Outcome:
-    """Run `job` in a child process and wait for it.
-
-    The child also saves and stops when the calling process ends, even by SIGKILL.
+    The child leaves its result, or why it failed, in the run's folder. It also saves and stops when the calling process
+    ends, even by SIGKILL.
 
     Args:
         job: the run.
@@ -82,30 +68,28 @@ def run_in_process(job: Job, stop: Callable[[], int]) -> Outcome:
         try:
             process, ours = _start(job)
             break
-        except (
-            OSError,
-            EOFError,
-        ) as error:  # the fork server was killed; the next start makes another
+        except (OSError, EOFError) as error:  # the next start makes another fork server
             if last:
-                return Outcome(FAILED, reason=f"its process could not be started ({_line(error)})")
+                fail(job, f"its process could not be started ({reason(error)})")
+                return FAILED
     asked = 0
     try:
-        while not wait([process.sentinel], _POLL):
-            if not asked and (asked := stop()):
-                process.terminate()
         # The run outlives a killed fork server, which then cannot report how it ends; its own pipe closes when it does.
-        while process.exitcode == _LOST and not ours.poll(_POLL):
+        while not wait([process.sentinel], _POLL) or (
+            process.exitcode == _LOST and not ours.poll(_POLL)
+        ):
             if not asked and (asked := stop()):
-                os.kill(process.pid, signal.SIGTERM)
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(process.pid, signal.SIGTERM)
     finally:
-        _stop(
-            process
-        )  # after an exception in this process the run may still be going: let it save first
-    return _outcome(ours, process.exitcode, asked)
+        # After an exception in this process the run may still be going: let it save first.
+        _stop(process)
+        ours.close()
+    return int(process.exitcode)
 
 
 def _start(job: Job) -> tuple[Any, Connection]:
-    """The process of a run, and the end of the pipe on which its `Outcome` arrives."""
+    """The process of a run, and the end of a pipe that closes when it ends."""
     # The fork server imports the preloaded modules when it starts, so they are named before the first process.
     context = context_for(job.command)
     ours, theirs = context.Pipe(duplex=False)
@@ -151,31 +135,6 @@ def _stop(process: Any) -> None:
             _running.remove(process)
 
 
-def _outcome(connection: Connection, code: int, asked: int) -> Outcome:
-    """The child's outcome; without it, the one of its exit status."""
-    with connection:
-        try:
-            # `recv` unpickles, which is safe here: the other end is our own child. A child that was killed half way
-            # through sends an end of file.
-            sent = connection.recv() if connection.poll() else None
-        except EOFError:
-            sent = None
-    if isinstance(sent, Outcome):
-        return sent
-    # Asked to stop, and ended without a word: it was stopped, with any status.
-    if asked:
-        return Outcome(128 + asked)
-    # `multiprocessing` gives -N for a process that signal N ended. Linux sends 9 when memory runs out.
-    if code < 0:
-        return Outcome(
-            FAILED, reason=f"killed by {signal.Signals(-code).name}{_MEMORY if code == -9 else ''}"
-        )
-    return Outcome(FAILED, reason=f"its process ended with status {code}")
-
-
-_MEMORY = ", perhaps for lack of memory"
-
-
 def _run_in_child(job: Job, folder: Path, connection: Connection) -> None:
     # The fork server ignores these, and a fork inherits that: a run has to hear them, to save and stop.
     for number in (signal.SIGTERM, signal.SIGUSR1):
@@ -196,31 +155,34 @@ def _run_in_child(job: Job, folder: Path, connection: Connection) -> None:
     # A parent that is killed sends no signal to its children: they would go on alone, and hold their folders' locks.
     # Not by SIGTERM: where one came before, a second ends the run without saving.
     end_with_parent(lambda: os.kill(os.getpid(), signal.SIGUSR1))
-    outcome = _run(job)
     with connection:
-        connection.send(outcome)
+        sys.exit(_run(job))
 
 
-def _run(job: Job) -> Outcome:
-    """Run the command; every exception becomes an `Outcome`."""
+def _run(job: Job) -> int:
+    """Run the command, and leave its result in the folder, or why it failed; returns the exit status."""
     assert job.cfg is not None
     try:
         # Checked when the sweep was planned, but hours may lie between, and files may have gone since.
         ready = check(job.command, job.cfg, job.folder, job.words)
         announce(ready, job.label)
         value = ready.run()
-        return Outcome(0, float(value) if isinstance(value, (int, float)) else None)
     except Preempted as error:
-        return Outcome(128 + error.signal)
+        return 128 + error.signal
     except (UserError, RunError) as error:
-        return Outcome(
-            USER_MISTAKE if isinstance(error, UserError) else FAILED, reason=_line(error)
-        )
+        status = USER_MISTAKE if isinstance(error, UserError) else FAILED
+        _note(job, _line(error), status)
+        return status
     # Any exception, SystemExit among them: it ends with this process, and the sweep needs a reason.
     except BaseException as error:
         traceback.print_exc()
-        sys.stderr.flush()
-        return Outcome(FAILED, reason=f"{type(error).__name__}: {_line(error)}".removesuffix(": "))
+        _note(job, f"{type(error).__name__}: {_line(error)}".removesuffix(": "))
+        return FAILED
+    # A training run leaves `summary.json` itself, and only where it came to its end.
+    if not (isinstance(job.cfg, TrainConfig) and (job.folder / SUMMARY).is_file()):
+        number = isinstance(value, (int, float))
+        write_json(job.folder / DONE, {"value": float(value) if number else None})
+    return 0
 
 
 def _line(error: BaseException) -> str:
@@ -241,25 +203,46 @@ def run_job(job: Job) -> None:
     (job.folder / FAILED_FILE).unlink(missing_ok=True)
     (job.folder / DONE).unlink(missing_ok=True)
     if job.cfg is None:
-        fail(job, Outcome(USER_MISTAKE, reason=job.refusal))
+        fail(job, job.refusal, USER_MISTAKE)
         return
-    outcome = run_in_process(job, lambda: stop_signal(job.sweep))
-    if outcome.status == 0:
-        _done(job, outcome)
-    elif outcome.reason:
-        fail(job, outcome)
-    # Stopped by a signal that the sweep knows nothing of, such as a kill by hand: a failure, else it would look
-    # unfinished.
+    status = run_in_process(job, lambda: stop_signal(job.sweep))
+    run = run_of(job.folder)
+    if run.state == "failed":
+        _say(job, f"failed: {run.reason}")
+    elif run.state == "done":
+        value = run.result.get("value", run.result.get("policy", {}).get("aihtr"))
+        shown = f": AIHTR {value:,.3f}" if value is not None else ""
+        if job.concurrent and not job.cfg.quiet:
+            say(f"({job.label}) {job.name} done{shown}")
+    # One that ended without a word was stopped, unless nobody has asked the sweep to stop.
     elif not stop_signal(job.sweep):
-        fail(job, Outcome(outcome.status, reason=f"stopped by signal {outcome.status - 128}"))
+        fail(job, _ended(status))
     remove_if_empty([job.folder])
 
 
-def fail(job: Job, outcome: Outcome) -> None:
+def _ended(status: int) -> str:
+    """How a process ended, by its exit status."""
+    if status < 0:
+        # Linux sends 9 when memory runs out.
+        memory = ", perhaps for lack of memory" if status == -9 else ""
+        return f"killed by {signal.Signals(-status).name}{memory}"
+    # Stopped by a signal that the sweep knows nothing of, such as a kill by hand.
+    return (
+        f"stopped by signal {status - 128}"
+        if status > 128
+        else f"its process ended with status {status}"
+    )
+
+
+def fail(job: Job, why: str, status: int = FAILED) -> None:
     """Leave the reason of the failure in the run's folder, and print it."""
     job.folder.mkdir(parents=True, exist_ok=True)
-    write_json(job.folder / FAILED_FILE, {"reason": outcome.reason, "status": outcome.status})
-    _say(job, f"failed: {outcome.reason}")
+    _note(job, why, status)
+    _say(job, f"failed: {why}")
+
+
+def _note(job: Job, why: str, status: int = FAILED) -> None:
+    write_json(job.folder / FAILED_FILE, {"reason": why, "status": status})
 
 
 def stop_signal(sweep: Path) -> int:
@@ -269,15 +252,6 @@ def stop_signal(sweep: Path) -> int:
         return int((sweep / STOP).read_text(encoding="ascii") or 0)
     except (OSError, ValueError):
         return 0
-
-
-def _done(job: Job, outcome: Outcome) -> None:
-    # A training run leaves `summary.json` itself, and only where it came to its end.
-    if not (isinstance(job.cfg, TrainConfig) and (job.folder / SUMMARY).is_file()):
-        write_json(job.folder / DONE, {"value": outcome.value})
-    if job.concurrent and job.cfg is not None and not job.cfg.quiet:
-        value = f": AIHTR {outcome.value:,.3f}" if outcome.value is not None else ""
-        say(f"({job.label}) {job.name} done{value}")
 
 
 def _is_free(job: Job) -> bool:

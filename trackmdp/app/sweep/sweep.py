@@ -14,7 +14,7 @@ from rich.console import Console
 from trackmdp.app.prepare import shown
 from trackmdp.app.sweep.launchers import threads_of
 from trackmdp.app.sweep.plan import Job, progress
-from trackmdp.app.sweep.process import STOP, Launch, Outcome, fail
+from trackmdp.app.sweep.process import STOP, Launch, fail
 from trackmdp.config import TrainConfig
 from trackmdp.config.options import is_number
 from trackmdp.config.resume import by_key, continued
@@ -132,7 +132,7 @@ def _run(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
         # Not "running": another process holds that folder, and is at it.
         jobs = [job for job in jobs if run_of(job.folder).state in ("cut", "waiting")]
     for job in jobs if not stop.received else ():
-        fail(job, Outcome(FAILED, reason=why))
+        fail(job, why)
 
 
 class _Stop(Signals):
