@@ -10,7 +10,7 @@ import io
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import replace
 from functools import partial
@@ -133,12 +133,11 @@ def _sweep(compose: Composer) -> int:
     from trackmdp.app.sweep.sweep import sweep
     from trackmdp.training.display import make_console
 
-    command, words = compose.command, run_words(compose.words)
-    cfg = _of_all_runs(compose)
+    command, cfg = compose.command, _of_all_runs(compose)
     # Now, so that a missing package is reported before anything is planned or written.
     sweeper = _plugin("sweeper", cfg.hydra.sweeper)
     launcher = _plugin("launcher", cfg.hydra.launcher)
-    _register_name(command, words, lambda: sweeper)
+    _register_name(compose, cfg)
     folder = folder_of(cfg, "hydra.sweep.dir")
     # Absolute: runs start in processes, perhaps on other machines, with another current folder.
     place = folder.absolute()
@@ -148,7 +147,7 @@ def _sweep(compose: Composer) -> int:
 
     console = make_console(cfg.quiet)
     planned = partial(plan, command, place, compose, console=console)
-    batches = maker(sweeper)(sweeper, words, place, planned)
+    batches = maker(sweeper)(sweeper, run_words(compose.words), place, planned)
     line = shlex.join(["trackmdp", command, "-m", *compose.words])
     made = make_folder("hydra.sweep.dir", folder)
     try:
@@ -158,7 +157,7 @@ def _sweep(compose: Composer) -> int:
         remove_if_empty(made)
 
 
-def _register_name(command: str, words: Sequence[str], sweeper: Callable[[], Any]) -> None:
+def _register_name(compose: Composer, cfg: DictConfig) -> None:
     """Have `${sweep_name:}` resolved, of which `hydra.sweep.dir` is made.
 
     The same words find the same folder again, and with it the runs that are done. Hydra's own time stamp would begin
@@ -168,8 +167,9 @@ def _register_name(command: str, words: Sequence[str], sweeper: Callable[[], Any
     def name() -> str:
         from trackmdp.app.sweep.plan import sweep_name
 
-        found = sweeper()
-        return sweep_name(command, words, getattr(found, "blocks", [found.name]) or [])
+        found = _plugin("sweeper", cfg.hydra.sweeper)
+        blocks = getattr(found, "blocks", [found.name]) or []
+        return sweep_name(compose.command, run_words(compose.words), blocks)
 
     OmegaConf.register_new_resolver("sweep_name", name, replace=True)
 
@@ -205,9 +205,7 @@ def _plugin(part: str, node: DictConfig) -> Any:
     if schema not in known.values():
         raise UserError(f"hydra/{part}: expected one of {', '.join(known)}")
     plain = OmegaConf.to_container(node, resolve=True)
-    typed = build_config(plain, schema, f"hydra.{part}.")
-    validate(typed, f"hydra.{part}")
-    return typed
+    return validate(build_config(plain, schema, f"hydra.{part}."), f"hydra.{part}")
 
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
@@ -240,8 +238,7 @@ def answer(compose: Composer, args: argparse.Namespace) -> bool:
     assert hydra is not None
     if args.cfg or args.info:
         cfg = compose(compose.words)
-        sweeper = partial(_plugin, "sweeper", cfg.hydra.sweeper)
-        _register_name(compose.command, run_words(compose.words), sweeper)
+        _register_name(compose, cfg)
         if args.package not in (None, "_global_") and OmegaConf.select(cfg, args.package) is None:
             raise UserError(f"--package {args.package}: not in the config")
     # Hydra logs its answers, and `logging` shows a traceback for each line that nobody reads: `--info defaults | head`.

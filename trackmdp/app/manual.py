@@ -165,10 +165,8 @@ def _all(command: str, values: dict[str, Any]) -> Iterator[str]:
     if any("override hydra/sweeper" in each for each in read_values(command)["defaults"]):
         for group in (f"hydra/{part}" for part in PLUGINS):
             default = next(iter(GROUPS[group]))
-            yield from (
-                "",
-                *_wrapped(f"With -m: {group}={'|'.join(GROUPS[group])} (default: {default})"),
-            )
+            shown = f"With -m: {group}={'|'.join(GROUPS[group])} (default: {default})"
+            yield from ("", *_wrapped(shown))
             for name in GROUPS[group]:
                 yield from _choice(group, name)
 
@@ -211,26 +209,21 @@ def _choice(group: str, name: str) -> Iterator[str]:
 def _example(command: str, chosen: str, group: str, name: str) -> Iterator[str]:
     """A line that sets the first option of a choice."""
     for key, value in choice_values(group, name).items():
-        if isinstance(options(GROUPS[group][name]).get(key), Option) and not isinstance(
-            value, (dict, list)
-        ):
-            shown = "FILE" if value == MISSING else json.dumps(value).strip('"')
-            # An interpolation is not something to type after a `=`: the shell would take the `$`.
-            if "$" not in shown:
-                yield f"  trackmdp {command} {chosen} {_prefix(group, name)}{key}={shown}"
-                return
+        shown = "FILE" if value == MISSING else json.dumps(value).strip('"')
+        # An interpolation is not something to type after a `=`: the shell would take the `$`, as it would brackets.
+        if key in options(GROUPS[group][name]) and not re.search(r"[$\[{]", shown):
+            yield f"  trackmdp {command} {chosen} {_prefix(group, name)}{key}={shown}"
+            return
 
 
 def _entries(schema: type[Any], values: Any, prefix: str) -> Iterator[str]:
-    heads = {
-        each.name: each.metadata["nested"] for each in fields(schema) if "nested" in each.metadata
-    }
+    heads = {each.name: each.metadata.get("nested") for each in fields(schema)}
     for key, item in options(schema).items():
         value = (values or {}).get(key)
         if isinstance(item, Option):
             yield from _entry(f"{prefix}{key}", item, value)
         else:
-            if key in heads:
+            if heads[key]:
                 yield from _wrapped(f"  {prefix}{key}: {heads[key]}")
             yield from _entries(item.schema, value, f"{prefix}{key}.")
 

@@ -84,6 +84,11 @@ class Training(Learning):
         """Iterations of the whole run."""
         return self.algorithm.iterations
 
+    @property
+    def evaluates(self) -> bool:
+        """Whether the policy of this iteration is evaluated, so that `score` is its own."""
+        return self.position.iteration == 1 or self.due(self.config.evaluation.every)
+
     def due(self, every: int) -> bool:
         """Whether this iteration is a multiple of `every`, or the last one."""
         return self.position.iteration == self.iterations or self.position.iteration % every == 0

@@ -118,6 +118,13 @@ class Display(Callback):
 
 
 _T = TypeVar("_T")
+_HELD_OUT: tuple[tuple[Any, ...], ...] = (
+    ("aihtr", "AIHTR", 2),
+    ("reward_per_step", "reward per step", 4),
+    ("accuracy", "accuracy", 2, 100.0, " %"),
+    ("sensors_per_step", "sensors per step", 2),
+)
+"""Figures on held-out tracks, their names, and how `with_interval` shows them."""
 
 
 @contextmanager
@@ -161,19 +168,13 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> Table:
 
 def show_held_out(console: Console, subject: str, report: dict[str, Any]) -> None:
     """The figures of a policy beside those of the references, with their intervals."""
-    shown: dict[str, tuple[Any, ...]] = {
-        "aihtr": ("AIHTR", 2),
-        "reward_per_step": ("reward per step", 4),
-    }
-    shown |= {"accuracy": ("accuracy", 2, 100.0, " %"), "sensors_per_step": ("sensors per step", 2)}
     rows = []
     # Figure by figure, policies under each other: side by side the intervals would be wider than 80 columns.
-    for key, (label, *form) in shown.items():
+    for key, label, *form in _HELD_OUT:
         rows.append([label, ""])
         for name, figures in report["figures"].items():
-            rows.append(
-                [f"  {subject if name == 'policy' else name}", with_interval(figures[key], *form)]
-            )
+            shown = with_interval(figures[key], *form)
+            rows.append([f"  {subject if name == 'policy' else name}", shown])
     console.print(
         table(counted_words(report["tracks"], "held-out track"), ["", "mean (95 % interval)"], rows)
     )

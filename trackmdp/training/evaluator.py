@@ -151,33 +151,28 @@ class HeldOutEvaluator(Evaluator):
         found: dict[str, PolicyTable] = {}
         # Only a policy that remembers more is compared with it.
         if task.keyed:
-            gamma, rounds = (
-                choice_values("algo", "model_based")[name] for name in ("gamma", "rounds")
-            )
-            cell = task.remembering()
-            plan = choose_plan(
-                cell, task.tracks, judge=task.validation, discount=gamma, rounds=rounds
-            )
-            found[CELL_ALONE] = plan.policy
+            own = choice_values("algo", "model_based")
+            found[CELL_ALONE] = choose_plan(
+                task.remembering(),
+                task.tracks,
+                judge=task.validation,
+                discount=own["gamma"],
+                rounds=own["rounds"],
+            ).policy
         return found | fixed_policies(task) | {ESTIMATED: estimated_qmdp(task)}
 
     def report(self, policy: PolicyTable) -> dict[str, Any]:
         """The report on a policy: its figures on the held-out tracks beside the references'."""
-        policies = {"policy": policy, **self.references}
-        found = {
-            name: self.replayed(each).intervals(self.tracks.names)
-            for name, each in policies.items()
+        figures = {}
+        for name, each in {"policy": policy, **self.references}.items():
+            found = self.replayed(each).intervals(self.tracks.names)
+            figures[name] = {key: asdict(interval) for key, interval in found.items()}
+        return {
+            "learned_from": len(self.world.tracks),
+            "validation": len(self.world.validation),
+            "tracks": len(self.tracks),
+            "figures": figures,
         }
-        figures = {
-            name: {key: asdict(interval) for key, interval in each.items()}
-            for name, each in found.items()
-        }
-        counts = {
-            "learned_from": self.world.tracks,
-            "validation": self.world.validation,
-            "tracks": self.tracks,
-        }
-        return {name: len(part) for name, part in counts.items()} | {"figures": figures}
 
 
 def fixed_policies(task: Task) -> dict[str, PolicyTable]:

@@ -16,11 +16,9 @@ from trackmdp.algos.common import Algorithm
 from trackmdp.config import CheckpointConfig, TrainConfig
 from trackmdp.config.tree import flatten
 from trackmdp.errors import Preempted, UserError
-from trackmdp.policies.policy import Policy
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Position, Row, Training
 from trackmdp.training.devices import make_device
-from trackmdp.training.evaluator import Score
 from trackmdp.training.inputs import identity
 from trackmdp.untrusted import decoded
 from trackmdp.world.group import Subject
@@ -176,15 +174,12 @@ def _check(state: Mapping[str, Any], cfg: TrainConfig, problem: Subject, file: P
 
 def _weights(state: Mapping[str, Any]) -> list[tuple[str, torch.Tensor]]:
     """The floating-point tensors of an algorithm's state that belong to networks."""
-    named = (
+    return [
         (name, value)
         for name, value in flatten(state).items()
         if not _NOT_WEIGHTS & {*name.split(".")}
-    )
-    return [
-        (name, value)
-        for name, value in named
-        if isinstance(value, torch.Tensor) and value.is_floating_point()
+        and isinstance(value, torch.Tensor)
+        and value.is_floating_point()
     ]
 
 
@@ -202,7 +197,6 @@ class Checkpoints(Callback):
         self._cfg, self._folder = cfg, folder
         self._best, self._rest = -math.inf, 0.0
         self._is_best = False
-        self._evaluated: tuple[int, float] = (-1, -math.inf)
 
     def on_start(self, trainer: Training) -> None:
         """Intervals count from where the run is.
@@ -213,10 +207,6 @@ class Checkpoints(Callback):
         file = checkpoint.named(self._folder, trainer.position.iteration)
         if trainer.position.iteration and file.is_file():
             checkpoint.point(file, best=self._is_best)
-
-    def on_evaluation(self, trainer: Training, policy: Policy, score: Score) -> None:  # noqa: ARG002
-        """Keep the AIHTR of this iteration's policy."""
-        self._evaluated = trainer.position.iteration, score.evaluation.aihtr
 
     def on_update(self, trainer: Training, row: Row) -> None:  # noqa: ARG002
         """Save after the last iteration, and where it is due."""
@@ -255,11 +245,8 @@ class Checkpoints(Callback):
         begin = time.monotonic()
         # Where checkpoints are counted in frames, one that a signal or the clock asked for is none of the candidates:
         # else which one is the best would depend on where the run was cut.
-        aihtr = (
-            self._attained(trainer)
-            if not self._cfg.every or self._is_planned(trainer)
-            else -math.inf
-        )
+        counts = not self._cfg.every or self._is_planned(trainer)
+        aihtr = self._attained(trainer) if counts else -math.inf
         self._is_best, self._best = aihtr > self._best, max(self._best, aihtr)
         # `_best` and `_is_best` are part of the state, so they are set before it is taken. The logs are called before
         # this callback: the lengths of files in their states include this iteration's row and episodes.
@@ -278,11 +265,9 @@ class Checkpoints(Callback):
         The last evaluation may be of an earlier policy, and of another one in a run that was resumed in
         between: best.pt would depend on where a run was cut.
         """
-        iteration, aihtr = self._evaluated
-        if iteration == trainer.position.iteration:
-            return aihtr
         # Evaluating draws from no generator of the run, so that saving more often leaves the run as it is.
-        return trainer.evaluator.score(trainer.policy()).evaluation.aihtr
+        score = trainer.score if trainer.evaluates else trainer.evaluator.score(trainer.policy())
+        return score.evaluation.aihtr
 
     def state_dict(self) -> dict[str, Any]:
         """The highest AIHTR of the checkpoints that count, and whether it is this one's."""

@@ -69,15 +69,13 @@ class Trainer(Training):
         super().__init__(problem, config, folder, console)
         self._nets = nets
         self.device = make_device(config.device)
-        self.callbacks = [
-            *callbacks,
-            Display(self.console, f"{config.algo.name} seed {config.seed}"),
-        ]
+        # Order: logs, the user's callbacks, checkpoints, display. A checkpoint holds how far the logs are written, so
+        # that they must have written this iteration's row before it is saved; the display shows it afterwards.
+        self.callbacks = [*callbacks]
         if folder is not None:
-            # Order: logs, the user's callbacks, checkpoints, display. A checkpoint holds how far the logs are written,
-            # so that they must have written this iteration's row before it is saved; the display shows it afterwards.
-            self.callbacks[-1:-1] = [Checkpoints(config.checkpoint, folder / "checkpoints")]
+            self.callbacks.append(Checkpoints(config.checkpoint, folder / "checkpoints"))
             self.callbacks[:0] = make_loggers(config, folder)
+        self.callbacks.append(Display(self.console, f"{config.algo.name} seed {config.seed}"))
         self.console.print(check_memory(config, problem.task, self.device))
 
     def policy(self) -> Any:
@@ -231,12 +229,11 @@ class Trainer(Training):
 
     def _account(self, diagnostics: dict[str, float], earned: float | None) -> None:
         """Evaluate where that is due, and call the callbacks; `earned`: mean reward of the batch's frames, if any."""
-        evaluated = self.position.iteration == 1 or self.due(self.config.evaluation.every)
-        if evaluated:
+        if self.evaluates:
             policy = self._revalue()
             for callback in self.callbacks:
                 callback.on_evaluation(self, policy, self.score)
-        row = self._row(evaluated, diagnostics, earned)
+        row = self._row(diagnostics, earned)
         for callback in self.callbacks:
             callback.on_update(self, row)
 
@@ -249,7 +246,7 @@ class Trainer(Training):
             self.score = self.evaluator.score(self._valued[1])
         return self._valued[1]
 
-    def _row(self, evaluated: bool, diagnostics: dict[str, float], earned: float | None) -> Row:
+    def _row(self, diagnostics: dict[str, float], earned: float | None) -> Row:
         """Counters, exact figures (empty between evaluations), diagnostics, and last the columns that time decides."""
         at, evaluation = self.position, self.score.evaluation
         exact = {
@@ -266,7 +263,7 @@ class Trainer(Training):
         return {
             "iteration": at.iteration,
             "frames": at.frames,
-            **(exact if evaluated else dict.fromkeys(exact)),
+            **(exact if self.evaluates else dict.fromkeys(exact)),
             "reward_per_frame": earned,
             "regret_while_collecting": so_far["regret_per_frame"],
             **diagnostics,

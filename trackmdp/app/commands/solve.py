@@ -131,12 +131,10 @@ def _show(
         ]
         for name, e in found.items()
     ]
-    rows.append(["proved bound", f"{solution.upper:,.6f}", "", "", ""])
-    called = {"paper": "printed"}  # as reports call it
-    rows += [
-        [f"{called.get(name, name)} bound", f"{value:,.6f}", "", "", ""]
-        for name, value in bound.items()
-    ]
+    # As reports call them: the paper's bound is the printed one.
+    bound = {"proved": solution.upper, "printed": bound["paper"]} | bound
+    del bound["paper"]
+    rows += [[f"{name} bound", f"{value:,.6f}", "", "", ""] for name, value in bound.items()]
     columns = ["policy", "AIHTR", "accuracy", "sensors per step", "safe per episode"]
     at.print(table("exact values", columns, rows))
     regret = max(regret_per_step(solution.upper, solution.evaluation), 0.0)
@@ -158,8 +156,7 @@ def _on_average(
         return
     found = trace(world, cfg.solver, 1e-3, near=most)
     mixture = found.at(sensors=most)
-    values = ((weight, value_of(world, each.table)) for weight, each in mixture.parts)
-    value = sum(weight * each.aihtr for weight, each in values)
+    value = sum(weight * value_of(world, each.table).aihtr for weight, each in mixture.parts)
     upper = max(value, found.worth(most, price))
     own = {"sensors": most, "binding": True, "lower": value, "upper": upper}
     write_json(folder / path, own | mixture_report(mixture, found))

@@ -171,18 +171,13 @@ def show_runs(
     states = [
         "skipped" if run.folder in skipped and run.state == "done" else run.state for run in runs
     ]
+    found = [run_figures(run) for run in runs]
     rows = [
-        [name, state, *_short(run), run.reason]
-        for name, state, run in zip(names, states, runs, strict=True)
+        [name, state, decimal(has.get("aihtr")), decimal(has.get("regret_per_step"), 4), run.reason]
+        for name, state, has, run in zip(names, states, found, runs, strict=True)
     ]
-    recorded = any("held_out_aihtr" in run_figures(run) for run in runs)
-    heads = [
-        "run",
-        "state",
-        "validation AIHTR" if recorded else "AIHTR",
-        "regret per step",
-        "reason",
-    ]
+    aihtr = "validation AIHTR" if any("held_out_aihtr" in has for has in found) else "AIHTR"
+    heads = ["run", "state", aihtr, "regret per step", "reason"]
     made = table(counted_words(len(runs), "run"), heads, rows)
     made.columns[1].justify = made.columns[4].justify = "left"
     console.print(made)
@@ -221,18 +216,15 @@ def _cell(text: str | None) -> str | None:
 
 def status_of(runs: Sequence[RunState]) -> int:
     """The exit status: 0 if all is done, 2 if only mistakes of the user failed, else 1."""
-    if all(run.state == "done" for run in runs):
-        return 0
-    statuses = [
-        known_object(run.folder / FAILED_FILE).get("status")
-        for run in runs
-        if run.state == "failed"
-    ]
     # A run that is neither done nor failed is nobody's mistake, and 2 means to a script: do not try again.
-    unfinished = any(run.state not in ("done", "failed") for run in runs)
-    return (
-        FAILED if unfinished or any(status != USER_MISTAKE for status in statuses) else USER_MISTAKE
-    )
+    statuses = {
+        known_object(run.folder / FAILED_FILE).get("status") if run.state == "failed" else FAILED
+        for run in runs
+        if run.state != "done"
+    }
+    if not statuses:
+        return 0
+    return USER_MISTAKE if statuses == {USER_MISTAKE} else FAILED
 
 
 def run_figures(run: RunState) -> dict[str, Any]:
@@ -252,8 +244,3 @@ def run_figures(run: RunState) -> dict[str, Any]:
         policy = {name: each["mean"] for name, each in several["figures"].items()}
         found["regret_per_step"] = (upper - policy["aihtr"]) / several["expected_length"]
     return {**(validation or policy), **found}
-
-
-def _short(run: RunState) -> list[str]:
-    found = run_figures(run)
-    return [decimal(found.get("aihtr")), decimal(found.get("regret_per_step"), 4)]
