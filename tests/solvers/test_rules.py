@@ -27,6 +27,8 @@ def test_fcr_by_hand() -> None:
     assert [np.flatnonzero(on).tolist() for on in chains.dense()[0]] == [[1], [3], [0]]
     chains = rules.fcr(line_world(0.75, 2))
     assert [np.flatnonzero(on).tolist() for on in chains.dense()[0]] == [[], [3], []]
+    in_grid = rules.fcr(line_world(0.75, 2), in_grid=True)
+    assert [np.flatnonzero(on).tolist() for on in in_grid.dense()[0]] == [[], [3], [0]]
 
 
 def test_fcr_takes_no_notice_of_misses_and_qmdp_does() -> None:

@@ -93,6 +93,8 @@ class ClockedConfig(BaselineConfig):
 class FcrConfig(BaselineConfig):
     """First cost reduction: decide as if nothing were observed any more."""
 
+    in_grid: bool = option("threshold c·p_in/r instead of c/r")
+
 
 @choice("baseline", "lookahead", makes="trackmdp.solvers.lookahead:solve")
 class LookaheadConfig(BaselineConfig):

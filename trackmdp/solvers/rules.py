@@ -62,11 +62,18 @@ def qmdp(world: World, *, in_grid: bool = False) -> PolicyTable:
     return unroll(world, lambda seen: _offer(world, seen, seen.inside if in_grid else seen.before))
 
 
-def fcr(world: World) -> PolicyTable:
-    """Sense j at n misses iff p_d(j) (e_x P^(n+1))_j r >= c_j: the prediction takes no notice of the misses."""
+def fcr(world: World, *, in_grid: bool = False) -> PolicyTable:
+    """Sense j at n misses iff p_d(j) (e_x P^(n+1))_j r >= c_j: the prediction takes no notice of the misses.
+
+    Args:
+        world: the problem.
+        in_grid: charge sensors only while the target is in the grid: p_d p_j r >= c_j p_in.
+    """
     # Without learning `mass` is e_x P^(n+1) itself: no probability of misses has to be divided by.
     always = np.ones(world.num_cells)
-    return unroll(world, lambda seen: _offer(world, seen, always), learns=False)
+    return unroll(
+        world, lambda seen: _offer(world, seen, seen.inside if in_grid else always), learns=False
+    )
 
 
 def myopic(world: World, *, threshold: float | None = None) -> PolicyTable:
