@@ -57,7 +57,9 @@ def maker(node: ChoiceConfig | type[ChoiceConfig]) -> Callable[..., Any]:
 
 def make(node: ChoiceConfig, *args: Any, **more: Any) -> Any:
     """Call the code of a choice with `args`, the options of the choice by name, and `more`."""
-    return maker(node)(*args, **vars(node), **more)
+    # By attribute, so that a test can record the options that are read.
+    given = {name: getattr(node, name) for name in vars(node)}
+    return maker(node)(*args, **given, **more)
 
 
 @lru_cache(maxsize=1)
