@@ -392,8 +392,10 @@ class HindsightLoss(nn.Module):
         """`[T+1]`, the actor's losses per clock, on the `chosen` paths, those from the cells `rows`."""
         logits = self.actor(rows)
         count, choices, _ = logits.shape
-        row, alive = replayed.row[:, chosen] - rows.start * choices, replayed.alive[:, chosen]
-        entry = replayed.entry[:, chosen] - rows.start * choices * self.view.width
+        row, entry = replayed.row[:, chosen], replayed.entry[:, chosen]
+        if first := rows.start * choices:
+            row, entry = row - first, entry - first * self.view.width
+        alive = replayed.alive[:, chosen]
         # Paths that reach each (x, n); every sensor on costs c on each of them, the one the target moves to included.
         arrivals = scatter_add(alive, row, count * choices).view(count, choices)
         price = arrivals.unsqueeze(-1) * self.sensors.prices[rows].unsqueeze(1)
