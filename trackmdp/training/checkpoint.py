@@ -17,7 +17,7 @@ from trackmdp.durable import own_folder, remove_parts, second_name, sync_folder,
 from trackmdp.errors import UserError
 from trackmdp.untrusted import decoded, load_tensors, opened
 
-CHECKPOINT_FORMAT = 8
+CHECKPOINT_FORMAT = 9
 BEST, LAST = "best.pt", "last.pt"
 _SEAL = 128
 _LARGEST = 2**38
