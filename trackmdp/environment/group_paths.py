@@ -107,10 +107,8 @@ class Walks:
         self._stand(place)
 
     def _stand(self, place: Tensor) -> None:
-        self._place = place
-        self.state, self.inside = (
-            each(place).numpy() for each in (self._paths.state, self._paths.inside)
-        )
+        self._place, self.state = place, self._paths.state(place).numpy()
+        self.inside = self._paths.inside(place).numpy()
 
     def move(self, row: IndexArray, step: int) -> None:
         """Move all targets; `row` are the episodes still running."""

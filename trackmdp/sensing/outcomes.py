@@ -137,9 +137,7 @@ class Outcomes:
     def reward(self, spent: Tensor, located: Tensor, forced: Tensor, in_grid: Tensor) -> Tensor:
         """`[B]` r·1[located] - c·|a|, where forced r·1[located] - D; 0 on the exit step."""
         # Costs are zeroed on the exit step together with the reward (eq. reward_func multiplies all of it).
-        safe = self._found
-        if not self._safe:
-            safe = torch.where(located, self._found, self._lost)
+        safe = self._found if self._safe else torch.where(located, self._found, self._lost)
         chosen = torch.where(located, self._gain, self._none) - spent
         return torch.where(forced, safe, chosen).masked_fill_(~in_grid, 0.0)
 
