@@ -80,11 +80,9 @@ class SetTable:
 
     def spent(self, n: int, price: Array) -> Array:
         """`[plans]` expected price of the sensors on after n misses; `price` `[S]` is per sensor."""
-        if self.alike:
-            return np.full(self.plans, (self.sets.toarray() * price).sum())
         # Rows n, n + (t_max + 1), ...: those of (0, n), (1, n), ..., one per plan.
-        rows = self.sets[n :: self.task.num_choices]
-        return rows.astype(np.float64) @ price
+        rows = self.sets if self.alike else self.sets[n :: self.task.num_choices]
+        return np.broadcast_to(rows.astype(np.float64) @ price, self.plans)
 
     def watched(self, used: Array) -> Array:
         """`[M]` how often each cell is covered, where the sets are used `[plans * (t_max + 1)]` often."""

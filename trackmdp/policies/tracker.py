@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol, Self
@@ -269,9 +269,11 @@ class Tracker:
         """The cell, which may be given by a position."""
         if at is None:
             return cell
-        if cell is not None or np.shape(at) != (2,):
-            raise UserError(f"{call}: cell={cell}, at={at}, expected a cell or a pair of numbers")
-        return self._task.cell_of(*at)
+        if cell is not None:
+            raise UserError(f"{call}: cell={cell} and at={at}, expected one of the two")
+        if not isinstance(at, Iterable) or len(pair := tuple(at)) != 2:
+            raise UserError(f"{call}: at={at}, expected two numbers")
+        return self._task.cell_of(*pair)
 
     def _locate(self, call: str, cell: int, mode: int | None, *, first: bool = False) -> None:
         """Note a detection; nothing is changed where it is refused."""
