@@ -214,19 +214,21 @@ def test_sets_are_read_back_from_a_list_and_from_an_array_file(
         ),
         ('{"t_max": 0, "sets": {"0": [[]], "1": [[]], "2": [[]], "3": [[]]}}', "not sets .*size"),
         ('{"size": [2, 2], "t_max": 0}', "not sets .no 'sets'"),
-        ('{"size": [2, 2], "t_max": 0, "sets": 4}', "not sets"),
+        ('{"size": [2, 2], "t_max": 0, "sets": 4}', "not sets .sets: expected 4 plans"),
         *(
             (
                 f'{{"size": [2, 2], "t_max": 0, "sets": {{"0": [[]], "1": {plan}, "2": [[]], "3": [[]]}}}}',
-                f"not sets .{said}",
+                f"not sets .plan 1: {said}",
             )
             for plan, said in (
-                ("[[0, 1.5]]", "plan 1: sensor 1.5, expected one from 0 to 3"),
-                ("[[true]]", "plan 1: sensor True, expected"),
-                ("[[-1]]", "plan 1: sensor -1, expected"),
-                ("[[], []]", "plan 1: expected 1 lists of sensors"),
-                ("[null]", ""),
-                ("null", ""),
+                ("[[0, 1.5]]", "sensor 1.5, expected a whole number from 0 to 3"),
+                ("[[true]]", "sensor True, expected"),
+                ("[[-1]]", "sensor -1, expected"),
+                ("[[], []]", "expected 1 lists of sensors"),
+                ("[null]", "expected 1 lists of sensors"),
+                ("[{}]", "expected 1 lists of sensors"),
+                ('[""]', "expected 1 lists of sensors"),
+                ("null", "expected 1 lists of sensors"),
             )
         ),
         *(

@@ -254,7 +254,7 @@ def test_belief_needs_a_motion() -> None:
     tracker = begun(world=small_world())
     for belief in ([1.0], ["x"] * 9, [[1 / 9]] * 9, [None] * 9, [float("nan")] * 9, [1e308] * 9, 3):
         state = tracker.state() | {"belief": belief}
-        with pytest.raises(UserError, match=r"^state: "):
+        with pytest.raises(UserError, match="state: belief, expected 9 probabilities"):
             tm.Tracker.restore(Policy.all_on(small_world()), state, small_world())
     tracker.exited()
     with pytest.raises(UserError, match="the target has exited"):

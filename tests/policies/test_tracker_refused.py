@@ -63,7 +63,8 @@ def test_modes_are_asked_for_where_detections_give_them() -> None:
         ({"misses": None}, "state: misses=None: expected"),
         ({"on": [9]}, "state: on=9: expected an integer from 0 to 8"),
         ({"on": [0, 0]}, "state: on=[0, 0]: expected sensors that can be on, in order"),
-        ({"on": 3}, "state: not one of a tracker"),
+        ({"on": 3}, "state: expected a list or None as on"),
+        ({"exited": 1}, "state: expected True or False as exited"),
         ({"task": {}}, "state: made for {}, expected {'size': "),
         (
             {"more": 1},
@@ -77,7 +78,7 @@ def test_a_state_that_does_not_fit_is_refused(change: dict[str, Any], message: s
     with pytest.raises(UserError) as caught:
         tm.Tracker.restore(policy, state | change)
     assert str(caught.value).startswith(message)
-    with pytest.raises(UserError, match=r"^state: not one of a tracker"):
+    with pytest.raises(UserError, match=r"^state: expected a dict"):
         tm.Tracker.restore(policy, 5)  # type: ignore[arg-type]
 
 

@@ -173,6 +173,8 @@ def test_what_another_run_left_is_not_taken(
 @pytest.mark.parametrize(
     "damage",
     [
+        {"position": {"iteration": -1}},
+        {"position": {"iteration": 8, "frames": 10**30, "seconds": 0.0, "reward": 0.0}},
         {"versions": [1]},
         {"versions": {"nope": "1"}},
         {"algorithm": [1]},
@@ -201,7 +203,14 @@ def test_a_sealed_state_that_makes_no_sense_is_refused_in_one_line(
     assert (mine / "metrics.csv").read_bytes() == before
 
 
-@pytest.mark.parametrize("content", [b"", b"x" * 9999, b"\0" * 9999, b"a\n" * 5000, b"aa\n" * 5000])
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(b"", b"x" * 9999, b"\0" * 9999, b"a\n" * 5000, b"aa\n" * 5000),
+        b"iteration,a\n" + b"1," * 5000,
+    ],
+    ids=["empty", "letters", "zeros", "one column", "another column", "half a row"],
+)
 def test_metrics_of_rubbish_stop_a_resume_before_anything_is_written(
     content: bytes, tmp_path: Path, whole: Path
 ) -> None:

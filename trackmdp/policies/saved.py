@@ -160,6 +160,8 @@ def _listed(task: Task, content: dict[str, Any]) -> PolicyTable:
     if content["size"] != list(task.size):  # as many cells in other rows would fit
         raise ValueError(f"size {content['size']}, rows and columns; expected {list(task.size)}")
     plans, count = content["sets"], task.num_keys
+    if not isinstance(plans, dict):
+        raise ValueError(f"sets: expected {count} plans by their keys")
     # Counted first: the memory in a stranger's file may make any number of keys.
     if (content["t_max"], len(plans)) != (task.t_max, count):
         raise ValueError(
@@ -168,13 +170,16 @@ def _listed(task: Task, content: dict[str, Any]) -> PolicyTable:
     rows: list[list[int]] = []
     for key in range(count):
         plan = plans[str(key)]
-        if len(plan) != task.num_choices:
+        lists = isinstance(plan, list) and all(isinstance(on, list) for on in plan)
+        if not lists or len(plan) != task.num_choices:
             raise ValueError(f"plan {key}: expected {task.num_choices} lists of sensors")
         for sensor in itertools.chain(*plan):
             # numpy would cut 1.5 to 1, and take true for it.
             if type(sensor) is not int or not 0 <= sensor < task.total_sensors:
                 most = task.total_sensors - 1
-                raise ValueError(f"plan {key}: sensor {sensor!r}, expected one from 0 to {most}")
+                raise ValueError(
+                    f"plan {key}: sensor {sensor!r}, expected a whole number from 0 to {most}"
+                )
         rows += plan
     pointer = np.cumsum([0, *map(len, rows)])
     indices = np.fromiter(itertools.chain(*rows), dtype=np.int64)

@@ -18,7 +18,6 @@ from trackmdp.policies.onnx_table import OnnxTable
 from trackmdp.policies.saved import load_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.sensing.task import Task
-from trackmdp.untrusted import decoded
 
 _NUMBERS = ("key", "misses", "steps", "seed")
 
@@ -211,9 +210,10 @@ class Tracker:
 
     def state(self) -> dict[str, Any]:
         """All that is needed to go on later, as JSON takes it; see `restore`."""
-        numbers = {name: getattr(self, f"_{name}") for name in (*_NUMBERS, "on", "exited")}
+        numbers = {name: getattr(self, f"_{name}") for name in _NUMBERS}
         belief = None if self._filter is None else self._belief[0].tolist()
-        return {"task": self._facts(), **numbers, "belief": belief}
+        own = {"on": self._on, "exited": self._exited, "belief": belief}
+        return {"task": self._facts(), **numbers, **own}
 
     @classmethod
     def restore(
@@ -224,37 +224,42 @@ class Tracker:
         Raises:
             UserError: the state is of another grid, other sensors or another memory, or is none.
         """
+        expected = {"task", *_NUMBERS, "on", "exited", "belief"}
+        if not isinstance(state, Mapping) or set(state) != expected:
+            raise UserError(f"state: expected a dict with {', '.join(sorted(expected))}")
         plan = _plan(policy)
+        task = plan.task
         # Any mode: key and belief are replaced below.
-        tracker = cls(plan, 0, mode=0 if plan.task.keys.modes > 1 else None, world=world)
-        with decoded("state", "one of a tracker"):
-            if set(state) != set(tracker.state()):
-                raise UserError(f"expected a dict with {', '.join(sorted(tracker.state()))}")
-            if state["task"] != tracker._facts():
-                raise UserError(f"made for {state['task']}, expected {tracker._facts()}")
-            tracker._restore(state)
-        return tracker
-
-    def _restore(self, state: Mapping[str, Any]) -> None:
-        """Take over the parts of a state of the same task."""
-        task = self._task
+        tracker = cls(plan, 0, mode=0 if task.keys.modes > 1 else None, world=world)
+        if state["task"] != tracker._facts():
+            raise UserError(f"state: made for {state['task']}, expected {tracker._facts()}")
         most = {"key": task.num_keys - 1, "misses": task.num_choices}
         for name in _NUMBERS:
-            number = whole_number(f"state: {name}", state[name], 0, most.get(name, math.inf))
-            setattr(self, f"_{name}", number)
-        self._exited, on = bool(state["exited"]), state["on"]
-        if on is not None:
-            last = task.total_sensors - 1
-            found = np.array([whole_number("state: on", each, 0, last) for each in on], np.int64)
-            if not ((np.diff(found) > 0).all() and self._possible(found).all()):
-                raise UserError(f"on={on}: expected sensors that can be on, in order")
-            self._on = found.tolist()
-        if self._filter is not None:
-            belief = np.array([state["belief"]], dtype=np.float64)
-            fits = belief.shape == self._belief.shape and (belief >= 0).all()
-            if not (fits and 0 < belief.sum() < 1.1):
-                raise UserError(f"belief: expected {self._belief.shape[1]} probabilities")
-            self._belief = belief
+            setattr(
+                tracker,
+                f"_{name}",
+                whole_number(f"state: {name}", state[name], 0, most.get(name, math.inf)),
+            )
+        if not isinstance(state["exited"], bool):
+            raise UserError("state: expected True or False as exited")
+        tracker._on, tracker._exited = tracker._restored(state["on"]), state["exited"]
+        if tracker._filter is not None:
+            tracker._belief = _probabilities(state["belief"], tracker._belief.shape[1])
+        return tracker
+
+    def _restored(self, on: Any) -> list[int] | None:
+        """The sensors that are on in a state.
+
+        Raises:
+            UserError: they are none that can be.
+        """
+        if not isinstance(on, list | None):
+            raise UserError("state: expected a list or None as on")
+        last = self._task.total_sensors - 1
+        found = [whole_number("state: on", each, 0, last) for each in on or ()]
+        if found != sorted(set(found)) or not self._possible(np.array(found, np.int64)).all():
+            raise UserError(f"state: on={found}: expected sensors that can be on, in order")
+        return None if on is None else found
 
     def _facts(self) -> dict[str, Any]:
         """The facts of the task that keys and sensor ids depend on."""
@@ -317,6 +322,20 @@ class Tracker:
         start = None if self.safe else np.full(len(sensors), self.cell)
         possible = self._task.choosable(start, sensors)
         return np.ones(len(sensors), dtype=bool) if possible is None else possible
+
+
+def _probabilities(given: Any, states: int) -> Array:
+    """`[1, states]`, the belief in a state.
+
+    Raises:
+        UserError: it is none.
+    """
+    numbers = given if isinstance(given, list) else []
+    if all(type(each) in (int, float) and 0 <= each <= 1.1 for each in numbers):
+        found = np.array([numbers], dtype=np.float64)
+        if found.shape[1] == states and 0 < found.sum() < 1.1:
+            return found
+    raise UserError(f"state: belief, expected {states} probabilities")
 
 
 def _plan(policy: Plan | str | Path) -> Plan:

@@ -80,9 +80,14 @@ class CsvLogger(RowLogger):
             source = str(self._path)
             with opened(self._path, most=2**36) as stream, decoded(source, "this run's metrics"):
                 names = next(csv.reader([stream.readline(2**16).decode()], strict=True))
-                # A file system without fsync may have lost the last rows.
-                if names[0] != "iteration" or stream.seek(0, os.SEEK_END) < self._position:
-                    raise ValueError(f"expected {self._position:,} bytes with a head of columns")
+                stream.seek(self._position - 1)
+                # A file system without fsync may have lost the last rows; or the file was changed meanwhile, and cut at
+                # this byte it would end in half a row.
+                if names[0] != "iteration" or stream.read(1) != b"\n":
+                    at = f"{self._position:,}, where the checkpoint was saved"
+                    raise ValueError(
+                        f"expected a head of columns, and the end of a row at byte {at}"
+                    )
         descriptor = reopen(self._path, empty=not self._position)
         self._file = os.fdopen(descriptor, "r+", newline="", encoding="utf-8")
         self._writer = csv.DictWriter(self._file, names)

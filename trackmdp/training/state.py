@@ -168,7 +168,10 @@ def _check(state: Mapping[str, Any], cfg: TrainConfig, problem: Subject, file: P
                 raise UserError(
                     f"{file}: written with {name} {written}, this is {here}; expected the same"
                 )
-        Position(**state["position"])
+        at = Position(**state["position"])
+        # A negative or far position would end the run at once, as if it were done.
+        if at.iteration != state["iteration"] or not 0 <= at.frames < 2**53:
+            raise ValueError(f"a position at iteration {at.iteration}, {at.frames} frames")
         state["callbacks"][Checkpoints.name]  # without these states metrics.csv would begin anew
 
 
