@@ -90,10 +90,8 @@ def _layers(
 ) -> Iterator[tuple[AnyArray, Box, AnyArray, Box]]:
     """Of each step belief and policy `[R, C]`, and the cells sensed, each with the box to be written."""
     # A few steps at a time: of all steps together they would take 12 bytes for each step and cell.
-    each, active = (
-        max(1, _AT_ONCE // math.prod(size)),
-        episode.action if covered is None else covered,
-    )
+    each = max(1, _AT_ONCE // math.prod(size))
+    active = episode.action if covered is None else covered
     for begin in range(0, len(episode), each):
         some = slice(begin, begin + each)
         sensed = active[some].reshape(-1, *size)

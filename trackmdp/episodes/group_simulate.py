@@ -46,10 +46,8 @@ class _Batch:
         draw, targets = paths.sampler.draw, self._shape[1]
         moves = Draws(seeds, lambda count, rng: draw(count * targets, rng).view(count, targets))
         place = torch.stack([paths.begin(rng) for rng in moves.generators])
-        self._walks, self._seen = (
-            Walks(paths, place, moves.at),
-            uniform(seeds, "report", targets),
-        )
+        self._walks = Walks(paths, place, moves.at)
+        self._seen = uniform(seeds, "report", targets)
 
     @torch.no_grad()
     def _steps(self) -> Iterator[GroupStep]:
@@ -62,7 +60,7 @@ class _Batch:
         return draws
 
     def run(self) -> Columns:
-        """GroupStep until the last target of the last episode has left, or until the last step allowed."""
+        """Step until the last target of the last episode has left, or until the last step allowed."""
         walks, cells = self._walks, self._task.num_cells
         start = np.where(walks.inside, walks.state % cells, cells).astype(np.int64)
         columns, length = joined([self._taken(step) for step in self._steps()])

@@ -131,10 +131,11 @@ def _show(
         ]
         for name, e in found.items()
     ]
-    # As reports call them: the paper's bound is the printed one.
-    bound = {"proved": solution.upper, "printed": bound["paper"]} | bound
-    del bound["paper"]
-    rows += [[f"{name} bound", f"{value:,.6f}", "", "", ""] for name, value in bound.items()]
+    called = {"paper": "printed"}  # as reports call it
+    rows += [
+        [f"{called.get(name, name)} bound", f"{value:,.6f}", "", "", ""]
+        for name, value in {"proved": solution.upper, **bound}.items()
+    ]
     columns = ["policy", "AIHTR", "accuracy", "sensors per step", "safe per episode"]
     at.print(table("exact values", columns, rows))
     regret = max(regret_per_step(solution.upper, solution.evaluation), 0.0)
