@@ -247,5 +247,7 @@ class ModelBased(Checkpointed):
 def _sensors_on(batch: TensorDictBase) -> float:
     """Sensors switched on by choice in a batch."""
     # At n = t_max + 1 the safe action replaces the policy's set, and no sensor is switched on.
-    free = batch["steps_since_detection"] < batch["action_history"].shape[-2]
-    return float((batch["action"].count_nonzero(-1) * free).sum())
+    action, choices = batch["action"], batch["action_history"].shape[-2]
+    forced = action[batch["steps_since_detection"] >= choices]
+    # Counted as a whole: per row it takes twenty times as long on 64 x 64 cells.
+    return float(action.count_nonzero() - forced.count_nonzero())

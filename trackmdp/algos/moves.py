@@ -116,9 +116,8 @@ def sensed_moves(batch: TensorDictBase, num_cells: int) -> tuple[Tensor, Tensor]
     located = (after["steps_since_detection"] == 0) | exited
     # `every` is decided before the move, so that steps are not selected by where the target goes; with all M sensors
     # on, a step ends located or exited.
-    action = batch["action"]
-    # Counted: `all` of bools takes ten times as long.
-    every = action.count_nonzero(-1) == action.shape[-1]
+    # The least byte of each row: on 64 x 64 cells `all` takes ten times as long, counting a hundred times.
+    every = batch["action"].view(torch.uint8).amin(-1).bool()
     whole = every & (batch["steps_since_detection"] == 0) & located
     return batch[name][whole], torch.where(exited, num_cells, after[name])[whole]
 
