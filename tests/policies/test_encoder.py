@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import one_hot
 
 from tests.helpers import headings, random_state, small_world
-from trackmdp.policies.nets import RelativeBias, StateEncoder, StateNetwork
+from trackmdp.policies.encoder import RelativeBias, StateEncoder, StateNetwork
 from trackmdp.sensing.task import Task
 from trackmdp.world.model import World
 
@@ -150,7 +150,7 @@ def test_the_relative_bias_of_a_large_grid_is_that_of_a_small_one(
     """Places worked out state by state, without a table of all pairs of cells."""
     task = Task((3, 5), cost=0.2, t_max=1)
     kept = RelativeBias(task)
-    monkeypatch.setattr("trackmdp.policies.nets._PAIRS", 15 * 15 - 1)
+    monkeypatch.setattr("trackmdp.policies.encoder._PAIRS", 15 * 15 - 1)
     computed = RelativeBias(task)
     assert max(part.numel() for part in computed.buffers()) == 15
     cell, n = torch.cartesian_prod(torch.arange(15), torch.arange(3)).view(5, 9, 2).unbind(-1)

@@ -15,7 +15,7 @@ from trackmdp.algos.gains import chain_returns, clocked_advantage, gather, scatt
 from trackmdp.algos.in_view import SensorsInView
 from trackmdp.algos.path_replay import Replay
 from trackmdp.arrays.types import IndexArray
-from trackmdp.policies.nets import CellClockNet
+from trackmdp.policies.cell_clock import CellClockNet
 from trackmdp.sensing.task import Task
 from trackmdp.sensing.windows import Window
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import torch
 
-from trackmdp.policies.nets import CellClockNet
+from trackmdp.policies.cell_clock import CellClockNet
 
 
 def test_rows_see_their_own_cell_and_clock_alone() -> None:
