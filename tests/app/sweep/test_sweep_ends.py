@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import time
@@ -12,10 +13,13 @@ import pytest
 from rich.console import Console
 
 from tests.app.sweep.runs import TINY, here, started, states
+from trackmdp.app.sweep import process
 from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.process import stop_signal
 from trackmdp.app.sweep.sweep import sweep
+from trackmdp.config.compose import compose
 from trackmdp.errors import Preempted, UserError
+from trackmdp.training.folders import run_of
 
 __all__ = ["here"]
 
@@ -62,6 +66,19 @@ def test_a_signal_is_told_to_the_runs_and_ends_the_sweep(tmp_path: Path) -> None
         before,
     )
     assert states(tmp_path) == ["waiting"]
+
+
+def test_a_run_whose_process_cannot_start_is_told_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def no_memory(job: Job) -> None:
+        raise OSError(errno.ENOMEM, "Cannot allocate memory")
+
+    monkeypatch.setattr(process, "_start", no_memory)
+    job = Job("train", tmp_path, "one", (), compose("train", {}))
+    process.run_job(job)
+    assert run_of(job.folder).state == "failed"
+    assert capsys.readouterr().err.count("could not be started") == 1
 
 
 @pytest.mark.slow

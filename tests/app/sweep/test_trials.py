@@ -120,6 +120,12 @@ def test_a_failed_trial_is_told_and_tried_again_by_the_next_call(
     assert len(runs_of(here / "all")) == 6
 
 
+def test_after_a_failed_trial_another_one_is_tried(here: Path) -> None:
+    refused = ["cost.sensor=interval(-2,-1)", "hydra.sweeper.n_trials=3"]
+    assert swept("hydra/sweeper=optuna", "quiet=true", *refused) == 2
+    assert states(here / "all") == ["failed"] * 3
+
+
 def test_the_objective_may_be_the_regret(here: Path) -> None:
     words = [
         "hydra.sweeper.n_trials=2",

@@ -70,7 +70,7 @@ def run_in_process(job: Job, stop: Callable[[], int]) -> int:
             break
         except (OSError, EOFError) as error:  # the next start makes another fork server
             if last:
-                fail(job, f"its process could not be started ({reason(error)})")
+                _note(job, f"its process could not be started ({reason(error)})")
                 return FAILED
     asked = 0
     try:

@@ -70,8 +70,9 @@ def trials(
         failed = 0
         # `n_trials` is the whole study's, so that a call that was interrupted and is repeated comes to the same
         # number; Optuna's own `optimize` would add so many each time.
-        while missing := max(0, cfg.n_trials - len(_completed(study)) - failed):
-            asked = [_ask(cfg, study, searched, place) for place in range(min(cfg.batch, missing))]
+        while (over := len(_completed(study)) + failed) < cfg.n_trials:
+            places = range(min(cfg.batch, cfg.n_trials - over))
+            asked = [_ask(cfg, study, searched, over, place) for place in places]
             jobs = [job_of(trial) for trial in asked]
             # A sampler may propose the same values twice within a batch: one run, with its result for both trials.
             yield list({job.name: job for job in jobs}.values())
@@ -129,12 +130,13 @@ def _distribution(override: Override) -> BaseDistribution:
 
 
 def _ask(
-    cfg: OptunaConfig, study: Any, searched: dict[str, BaseDistribution], place: int
+    cfg: OptunaConfig, study: Any, searched: dict[str, BaseDistribution], over: int, place: int
 ) -> BaseTrial:
     """The next trial. Draws depend on the seed and on the results known, not on interruptions."""
-    # A sampler's state is not kept in the storage. Seeded anew from the results, the choice after an interruption is
-    # the one that would have come without it. 2^32: NumPy takes no larger seed.
-    seed = derive(cfg.seed, "optuna", len(_completed(study)), place) % 2**32
+    # A sampler's state is not kept in the storage. Seeded anew from the number of trials that are over, the choice
+    # after an interruption is the one that would have come without it. Failed ones count: else they would be drawn
+    # again. 2^32: NumPy takes no larger seed.
+    seed = derive(cfg.seed, "optuna", over, place) % 2**32
     study.sampler = _sampler(cfg, seed)
     try:
         return cast(BaseTrial, study.ask(searched))
