@@ -15,6 +15,7 @@ import trackmdp as tm
 from tests.episodes.logs import CONFIG, rewritten
 from tests.solvers.test_group import tiny
 from trackmdp.app.cli import main
+from trackmdp.episodes import schema, writer
 from trackmdp.episodes.belief_filter import beliefs
 from trackmdp.episodes.differences import first_difference
 from trackmdp.episodes.episode import Episode
@@ -30,6 +31,7 @@ from trackmdp.solvers.several.merging import Rule, make_rule
 from trackmdp.solvers.solve import solve
 from trackmdp.world.group import Group
 from trackmdp.world.model import World
+from trackmdp.world.problem_file import problem_bytes
 
 
 def missing(seed: int = 5) -> Group:
@@ -259,6 +261,20 @@ def test_a_cut_log_gives_back_its_whole_episodes(log: Path, tmp_path: Path) -> N
     assert all(
         first_difference(a, b) is None for a, b in zip(expected[: len(found)], found, strict=True)
     )
+
+
+def test_a_log_with_a_problem_file_for_each_motion_is_of_another_format(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Format 4 had them: neither damage, nor anything that recover=true would mend."""
+    with monkeypatch.context() as older:
+        older.setattr(schema, "LOG_FORMAT", "4")
+        older.setattr(writer, "problem_bytes", lambda group: problem_bytes(group.worlds[0]))
+        file = write(tmp_path / "a.mcap", played(1))
+    for read in (EpisodeReader, recover):
+        with pytest.raises(UserError, match=r"^file=.*a.mcap: format 4 \(.*\), expected format 5$"):
+            read(file)
+    assert [each.name for each in tmp_path.iterdir()] == ["a.mcap"]
 
 
 @pytest.mark.parametrize("said", ["x", "0 " * 1001])

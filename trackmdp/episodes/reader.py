@@ -105,7 +105,7 @@ class EpisodeReader:
         return self._rows[number]
 
     def read(self, number: int) -> Any:
-        """Episode `number`, an `Episode`, or a `Episode` of several targets."""
+        """Episode `number`, of one target or of several."""
         row = self.row(number)
         with reading(self.file):
             ends = int(row["start_time"]), int(row["end_time"])

@@ -19,7 +19,7 @@ from trackmdp.errors import UserError
 from trackmdp.untrusted import decoded
 from trackmdp.world.problem_file import PROBLEM
 
-LOG_FORMAT = "4"
+LOG_FORMAT = "5"
 """Version of this layout; a reader refuses any other."""
 
 RUN, POLICY, END = "trackmdp.run", "trackmdp.policy", "trackmdp.end"
