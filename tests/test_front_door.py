@@ -110,7 +110,7 @@ def test_signatures_show_the_values_of_conf() -> None:
 
 def test_a_world_is_that_of_the_command_line() -> None:
     from tests.helpers import train_config
-    from trackmdp.world.make import make_problem
+    from trackmdp.world.configured import make_problem
 
     world = tm.make_world(
         "drift", size=4, cost=np.linspace(0.1, 0.2, 16), direction=90, max_steps=30

@@ -14,7 +14,7 @@ from trackmdp.app.words import parsed
 from trackmdp.config.compose import compose
 from trackmdp.errors import UserError, output_of
 from trackmdp.training.devices import machine
-from trackmdp.world.make import build_world
+from trackmdp.world.configured import build_world
 
 Row = dict[str, Any]
 PARTS = (

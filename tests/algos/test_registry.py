@@ -19,7 +19,7 @@ from trackmdp.config import GROUPS, PerSensorConfig
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers import optimal
 from trackmdp.training import checkpoint
-from trackmdp.world.make import build_world
+from trackmdp.world.configured import build_world
 
 ROOT = Path(__file__).parents[2]
 TIMED = ("seconds", "frames_per_second")

@@ -25,7 +25,7 @@ from trackmdp.episodes.simulate import resimulate, simulate
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import as_policy
 from trackmdp.solvers import bounds, rules
-from trackmdp.world.make import build_world
+from trackmdp.world.configured import build_world
 
 
 @pytest.fixture(scope="module")

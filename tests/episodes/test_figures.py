@@ -15,7 +15,7 @@ from trackmdp.episodes.simulated_figures import Simulation
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers.solve import baseline_policy
 from trackmdp.training.evaluator import ExactEvaluator
-from trackmdp.world.make import build_world
+from trackmdp.world.configured import build_world
 from trackmdp.world.model import World
 
 FIGURES = ("aihtr", "accuracy", "sensors_per_step", "safe_per_episode", "expected_length")

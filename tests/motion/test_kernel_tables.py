@@ -19,7 +19,7 @@ from tests.motion.kernels import paper
 from trackmdp import untrusted
 from trackmdp.errors import UserError
 from trackmdp.motion.kernels import load_table
-from trackmdp.world.make import build_world
+from trackmdp.world.configured import build_world
 from trackmdp.world.model import World
 
 

@@ -15,7 +15,8 @@ from tests.motion.kernels import paper
 from trackmdp.errors import UserError
 from trackmdp.motion import kernels
 from trackmdp.motion.kernels import drift, random_walk
-from trackmdp.world.make import build_world, make_world
+from trackmdp.world.configured import build_world
+from trackmdp.world.make import make_world
 
 
 def window_of(size: int, cell: int, radius: int = 1) -> np.ndarray:

@@ -24,7 +24,7 @@ from trackmdp.motion.modes import (
     regimes,
     steps_of,
 )
-from trackmdp.world.make import make_problem
+from trackmdp.world.configured import make_problem
 from trackmdp.world.model import World
 
 WALK = {

@@ -15,7 +15,7 @@ from trackmdp.motion.modes import (
 )
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.world.make import make_problem
+from trackmdp.world.configured import make_problem
 from trackmdp.world.model import World
 
 

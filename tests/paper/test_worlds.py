@@ -10,7 +10,7 @@ import pytest
 from tests.helpers import BORDERS, configured
 from tests.solvers import worlds
 from trackmdp.paper.worlds import COSTS, SUPPORTS, paper_kernel, paper_world
-from trackmdp.world.make import build_world
+from trackmdp.world.configured import build_world
 from trackmdp.world.model import World
 
 

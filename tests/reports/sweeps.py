@@ -19,7 +19,7 @@ from trackmdp.solvers import rules
 from trackmdp.solvers.evaluation import figures
 from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.training.folders import write_summary
-from trackmdp.world.make import build_world
+from trackmdp.world.configured import build_world
 from trackmdp.world.problem_file import PROBLEM, problem_bytes
 
 VERSIONS = {"trackmdp": "0.1.0", "torch": "2.13.0"}

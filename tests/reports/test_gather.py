@@ -32,7 +32,7 @@ from trackmdp.training.display import make_console
 from trackmdp.training.folders import read_summary, write_summary
 from trackmdp.training.lock import locked
 from trackmdp.training.run import load_run
-from trackmdp.world.make import build_world
+from trackmdp.world.configured import build_world
 
 Change = Callable[[Path], Any]
 

@@ -23,8 +23,8 @@ from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import load_policy, read_sets, save_policy, write_sets
 from trackmdp.sensing.coverage import Coverage, discs
+from trackmdp.sensing.makers import footprint
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.world.make import footprint
 from trackmdp.world.model import World
 
 LINE = np.diag(np.full(3, 0.9), 1)

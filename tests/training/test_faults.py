@@ -31,7 +31,7 @@ from trackmdp.training import checkpoint, collect
 from trackmdp.training.callbacks import Callback, Training
 from trackmdp.training.lock import locked
 from trackmdp.training.state import _weights
-from trackmdp.world.make import build_world
+from trackmdp.world.configured import build_world
 
 
 @pytest.fixture(scope="module")

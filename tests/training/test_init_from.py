@@ -14,7 +14,7 @@ from trackmdp.algos.common import make_algorithm
 from trackmdp.app.cli import main
 from trackmdp.training import checkpoint
 from trackmdp.training.state import take_weights
-from trackmdp.world.make import build_world
+from trackmdp.world.configured import build_world
 
 
 def test_weights_are_taken_where_they_fit(

@@ -18,7 +18,7 @@ from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.callbacks import Callback, Position, Training
 from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.training.state import Checkpoints
-from trackmdp.world.make import build_world
+from trackmdp.world.configured import build_world
 
 
 @pytest.mark.parametrize(

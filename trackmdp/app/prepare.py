@@ -149,7 +149,7 @@ def _problem(cfg: WorldConfig, folder: Path) -> Subject:
         from trackmdp.training.inputs import problem_of
 
         return problem_of(cfg, folder)
-    from trackmdp.world.make import make_problem
+    from trackmdp.world.configured import make_problem
 
     return make_problem(cfg)
 

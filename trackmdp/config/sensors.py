@@ -31,7 +31,7 @@ class CostConfig(ChoiceConfig):
     """
 
 
-@choice("cost", "paper", makes="trackmdp.world.make:paper_cost")
+@choice("cost", "paper", makes="trackmdp.sensing.makers:paper_cost")
 class PaperCostConfig(CostConfig):
     """The paper's rewards: r for a detection, c per sensor switched on, D for the safe action."""
 
@@ -137,7 +137,7 @@ class SensorConfig(ChoiceConfig):
             )
 
 
-@choice("sensor", "perfect", makes="trackmdp.world.make:perfect")
+@choice("sensor", "perfect", makes="trackmdp.sensing.makers:perfect")
 class PerfectSensorConfig(SensorConfig):
     """The paper's sensors: one that is on always locates the target in its cell."""
 
@@ -148,7 +148,7 @@ def _chance(help: str) -> Any:
     return file_option(help, expects)
 
 
-@choice("sensor", "miss", makes="trackmdp.world.make:miss")
+@choice("sensor", "miss", makes="trackmdp.sensing.makers:miss")
 class MissConfig(SensorConfig):
     """Sensors that miss: one that is on reports the target in its cell with probability p_d, and never another cell."""
 
@@ -165,7 +165,7 @@ class MissConfig(SensorConfig):
         _check_chance(f"{key}.p_s", self.p_s, root.grid)
 
 
-@choice("sensor", "false_alarm", makes="trackmdp.world.make:false_alarm")
+@choice("sensor", "false_alarm", makes="trackmdp.sensing.makers:false_alarm")
 class FalseAlarmConfig(SensorConfig):
     """For evaluate alone: sensors that also report targets that are not there; a policy believes each report."""
 
@@ -193,7 +193,7 @@ class FalseAlarmConfig(SensorConfig):
         _check_chance(f"{key}.p_d", self.p_d, root.grid)
 
 
-@choice("sensor", "footprint", makes="trackmdp.world.make:footprint")
+@choice("sensor", "footprint", makes="trackmdp.sensing.makers:footprint")
 class FootprintConfig(MissConfig):
     """Wide sensors: each covers several cells, and reports a target in any of them with probability p_d of its cell."""
 

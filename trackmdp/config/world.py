@@ -214,7 +214,7 @@ class TableConfig(KernelConfig):
         return f"kernel.path={self.path}"
 
 
-@choice("kernel", "tracks", makes="trackmdp.world.make:recorded")
+@choice("kernel", "tracks", makes="trackmdp.world.configured:recorded")
 class TracksConfig(KernelConfig):
     """No motion model but recorded tracks: learn from most of them, choose by some, and judge on those held out."""
 

@@ -18,8 +18,9 @@ from trackmdp.config.learning import file_of_classes
 from trackmdp.config.resume import fixed_options
 from trackmdp.config.tree import config_text
 from trackmdp.durable import write_bytes, write_text
+from trackmdp.world.configured import make_problem
 from trackmdp.world.group import Group, Subject, learned_in
-from trackmdp.world.make import OF_TASK, make_problem
+from trackmdp.world.make import OF_TASK
 from trackmdp.world.problem_file import PROBLEM, problem_bytes, problem_digest, read_problem
 
 

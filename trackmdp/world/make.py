@@ -1,34 +1,26 @@
-"""From names and options, or from a config, to a world or to recorded tracks; and the makers of the group `sensor`."""
+"""From arguments in Python to a world or to recorded tracks: `make_world` and `load_tracks`."""
 
 from __future__ import annotations
 
 import difflib
 import math
-import re
 from collections.abc import Mapping, Sequence
-from inspect import signature
 from pathlib import Path
 from typing import Any, Literal, cast, overload
 
 import numpy as np
 import numpy.typing as npt
 
-from trackmdp.arrays.files import per_cell, read_matrix
-from trackmdp.arrays.numbers import PRICES, PROBABILITIES, array_of
-from trackmdp.config import WorldConfig
+from trackmdp.arrays.numbers import array_of
 from trackmdp.config.compose import Default, compose, default, given
 from trackmdp.config.options import GROUPS, options
-from trackmdp.config.registry import make, maker
-from trackmdp.config.sensors import lattice
 from trackmdp.errors import UserError
-from trackmdp.grid.place import Place
-from trackmdp.grid.size import TASK_BYTES, Size, check_fits, grid_size
-from trackmdp.recordings.track_files import read_track_file
+from trackmdp.grid.size import Size, grid_size
 from trackmdp.recordings.tracks import Recorded
-from trackmdp.sensing.coverage import Coverage, discs
+from trackmdp.world.configured import build_world, make_problem
 from trackmdp.world.group import Group
 from trackmdp.world.model import World
-from trackmdp.world.problem import Problem, modelled
+from trackmdp.world.problem import modelled
 
 OF_TASK = {
     "size": "grid.size",
@@ -44,6 +36,9 @@ OF_TASK = {
 }
 """Arguments of `make_world` and `load_tracks` -> options of the command line."""
 
+_OF_MISSES = {"detection": "sensor.p_d", "safe_detection": "sensor.p_s"}
+"""The same of sensors that miss."""
+
 _OF_SENSORS = {
     "p_d": "detection",
     "p_s": "safe_detection",
@@ -52,11 +47,6 @@ _OF_SENSORS = {
 """Names of the command line -> arguments of `make_world` and `load_tracks`."""
 
 _OF_PLACE = {name: f"grid.{name}" for name in ("cell", "origin", "crs")}
-
-
-_KERNEL_BYTES = 500
-"""Bytes of each cell while a motion kernel is made. Measured on 1,500 x 1,500 cells: random_walk 570, random_support
-580, drift 940."""
 
 
 @overload
@@ -200,109 +190,6 @@ def load_tracks(
     return made if targets == 1 else Group.of_tracks(made, targets)
 
 
-def make_problem(cfg: WorldConfig, *, frame: Any = None) -> Problem:
-    """The world a config describes, or its recorded tracks.
-
-    Args:
-        cfg: the config.
-        frame: positions as a DataFrame of pandas, in place of the file of `kernel=tracks`.
-
-    Raises:
-        UserError: the grid does not fit into memory, a file is missing or malformed, or the kernel or a track breaks a
-            rule.
-    """
-    bytes_each = _KERNEL_BYTES if cfg.kernel.is_motion else TASK_BYTES
-    check_fits("grid.size", cfg.grid.size, bytes_each)
-    if cfg.kernel.is_motion:
-        return build_world(cfg)
-    return make(cfg.kernel, cfg.grid.size, where=cfg.grid.place, frame=frame, **of_task(cfg))
-
-
-def build_world(cfg: WorldConfig) -> World:
-    """The world a config describes.
-
-    Raises:
-        UserError: a file is missing or malformed, or the kernel breaks a rule (`motion/kernel_checks.py`).
-    """
-    own = {name: getattr(cfg.kernel, name) for name in options(type(cfg.kernel))}
-    modes = {"reveals": own.pop("reveals", False)}
-    made = maker(cfg.kernel)(cfg.grid.size, **own)
-    if cfg.kernel.hides:
-        made, modes["modes"] = made
-    task = of_task(cfg)
-    try:
-        return World(made, cfg.grid.sides, **task, **modes)
-    except UserError as error:  # with the option at fault
-        raise UserError(re.sub("^kernel(?=:)", lambda _: cfg.kernel.source, str(error))) from None
-
-
-def recorded(
-    size: Size,
-    *,
-    path: str,
-    format: str | None,
-    ends: str,
-    starts: str | None,
-    held_out: float,
-    validation: float,
-    seed: int,
-    min_length: int | None,
-    markov: bool,
-    where: dict[str, Any],
-    frame: Any,
-    columns: list[str] | None,
-    **others: Any,
-) -> Recorded:
-    """The recorded tracks in a file, in their three parts; see `TracksConfig` for the options.
-
-    Raises:
-        UserError: the file is missing or malformed, a track is too short, or one of the three parts would be empty.
-    """
-    gridding = where | {name: others.pop(name) for name in ("step", "max_gap")}
-    anywhere = None if starts is None else starts == "anywhere"
-    of_task = others | {"markov": markov, "anywhere": anywhere}
-    # A located cell, t_max + 1 free choices and the forced step: t_max + 3 cells, the segment that hindsight learns
-    # from.
-    shortest = max(
-        min_length or of_task["t_max"] + 3, 1 if ends == "exit" else 2
-    )  # a cut track of one has no step
-    (mine, chosen, judged), loaded, place = read_track_file(
-        path if frame is None else frame,
-        grid_size(size),
-        ends == "exit",
-        shortest,
-        format,
-        gridding | {"columns": columns},
-        (held_out, validation, seed),
-    )
-    return Recorded(
-        mine, size, validation=chosen, held_out=judged, loaded=loaded, place=place, **of_task
-    )
-
-
-def paper_cost(
-    size: Size,
-    *,
-    reward: float,
-    sensor: float | list[float] | str,
-    safe: float | None,
-    budget: int | None,
-    mean_budget: float | None,  # noqa: ARG001 (a matter of solving)
-    sensors: int | None = None,
-) -> dict[str, Any]:
-    """r, c, D and B as arguments of `Task`; `sensors` is their number where there is not one in each cell.
-
-    Raises:
-        UserError: a file of prices is missing or malformed, or does not have one price per sensor.
-    """
-    return {
-        "reward": reward,
-        "cost": per_cell("cost.sensor", sensor, size, PRICES, sensors),
-        "safe_cost": safe,
-        "budget": budget,
-    }
-
-
 def _words(arguments: dict[str, Any]) -> dict[str, Any]:
     """The arguments of `make_world` or `load_tracks`, and the options of a kernel among them, by command-line names.
 
@@ -310,10 +197,15 @@ def _words(arguments: dict[str, Any]) -> dict[str, Any]:
         UserError: an option of no kernel resembles an argument, or is one of the command line's sensors.
     """
     size, known = arguments["size"], OF_TASK | _OF_PLACE
-    missing = (_flat(p, arguments.pop(p, 1.0), size) for p in ("detection", "safe_detection"))
-    of_task = sensor_words(*missing) | {
+    chances = {
+        option: _flat(name, arguments.pop(name, 1.0), size) for name, option in _OF_MISSES.items()
+    }
+    of_task = {
         known[name]: _flat(name, arguments.pop(name), size) for name in known if name in arguments
     }
+    # The default sensors have no option for a probability of 1.
+    if any(isinstance(p, str | Path) or not np.all(np.asarray(p) == 1.0) for p in chances.values()):
+        of_task |= {"sensor": "miss"} | chances
     of_kernels = {name for schema in GROUPS["kernel"].values() for name in options(schema)}
     for name in arguments.keys() - of_kernels:
         if name in _OF_SENSORS:
@@ -341,83 +233,3 @@ def _flat(name: str, value: Any, size: Size) -> Any:
     if isinstance(value, np.ndarray) and value.dtype.kind == "f" and value.ndim == 1:
         return [None if math.isnan(each) else each for each in value.tolist()]
     return value
-
-
-def sensor_words(detection: Any, safe_detection: Any) -> dict[str, Any]:
-    """p_d and p_s by the names of the command line; nothing where all are 1, so that no sensor misses."""
-    if all(
-        not isinstance(p, (str, Path)) and np.all(np.asarray(p) == 1.0)
-        for p in (detection, safe_detection)
-    ):
-        return {}
-    return {"sensor": "miss", "sensor.p_d": detection, "sensor.p_s": safe_detection}
-
-
-def of_task(cfg: WorldConfig) -> dict[str, Any]:
-    """Costs and limits of a world config, as arguments of `Task`."""
-    sensors: dict[str, Any] = make(cfg.sensor, cfg.grid.size)
-    count = {}
-    if (coverage := Coverage.of(sensors.get("coverage"), cfg.grid.num_cells)) is not None:
-        sensors["coverage"] = coverage
-        if "sensors" in signature(maker(cfg.cost)).parameters:  # prices per sensor, not per cell
-            count = {"sensors": coverage.num_sensors}
-    costs: dict[str, Any] = make(cfg.cost, cfg.grid.size, **count)
-    limits = {"t_max": cfg.grid.t_max, "max_steps": cfg.grid.max_steps, "window": cfg.grid.window}
-    place = {"place": Place.of(**cfg.grid.place)} if cfg.kernel.is_motion else {}
-    return costs | sensors | limits | place | cfg.remembered
-
-
-def perfect(size: Size) -> dict[str, Any]:  # noqa: ARG001
-    """No sensor misses, the default of a `Task`."""
-    return {}
-
-
-def miss(
-    size: Size, *, p_d: float | list[float] | str, p_s: float | list[float] | str
-) -> dict[str, Any]:
-    """p_d of the sensors and p_s of the safe action.
-
-    Raises:
-        UserError: a file is missing or malformed, or does not have one probability per cell.
-    """
-    return {
-        "detection": per_cell("sensor.p_d", p_d, size, PROBABILITIES),
-        "safe_detection": per_cell("sensor.p_s", p_s, size, PROBABILITIES),
-    }
-
-
-def false_alarm(size: Size, *, p_d: float | list[float] | str, p_f: float) -> dict[str, Any]:  # noqa: ARG001
-    """p_d of the sensors; p_f is no matter of the task, which policies are made for, but of their evaluation.
-
-    Raises:
-        UserError: as `miss`.
-    """
-    return {"detection": per_cell("sensor.p_d", p_d, size, PROBABILITIES)}
-
-
-def footprint(
-    size: Size,
-    *,
-    radius: float,
-    spacing: int,
-    path: str | None,
-    p_d: float | list[float] | str,
-    p_s: float | list[float] | str,
-) -> dict[str, Any]:
-    """Discs of `radius` around the places of a lattice, or the footprints in a file; p_d and p_s as of `miss`.
-
-    Raises:
-        UserError: a file is missing or malformed, or does not fit this grid.
-    """
-    rows, columns = grid_size(size)
-    missing = miss(size, p_d=p_d, p_s=p_s)
-    if path is not None:
-        table = read_matrix("sensor.path", path, name="coverage")
-        try:
-            return missing | {"coverage": Coverage.of(table, rows * columns)}
-        except UserError as error:  # with the option at fault
-            fault = str(error).removeprefix("coverage: ")
-            raise UserError(f"sensor.path={path}: {fault}") from error
-    places = np.meshgrid(lattice(rows, spacing), lattice(columns, spacing), indexing="ij")
-    seen = discs((rows, columns), np.stack(places, axis=-1).reshape(-1, 2), radius)
-    return missing | {"coverage": Coverage.of(seen, rows * columns)}

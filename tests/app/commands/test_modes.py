@@ -13,7 +13,7 @@ from trackmdp.config.compose import compose
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import linear, value
 from trackmdp.training.devices import needs
-from trackmdp.world.make import make_problem
+from trackmdp.world.configured import make_problem
 from trackmdp.world.model import World
 
 WORLD = ["kernel=heading", "grid.size=3", "kernel.exit_probability=0.1", "quiet=true"]

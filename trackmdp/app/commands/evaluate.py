@@ -21,6 +21,7 @@ from trackmdp.config import (
     load_run_config,
     to_yaml,
 )
+from trackmdp.config.registry import make
 from trackmdp.durable import write_json, write_text
 from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.filtered import simulate_filter
@@ -50,7 +51,6 @@ from trackmdp.training.evaluator import CELL_ALONE, ExactEvaluator, HeldOutEvalu
 from trackmdp.training.folders import SUMMARY, check_files, read_summary
 from trackmdp.training.run import trained
 from trackmdp.world.group import Group, Subject, group_of, one_target
-from trackmdp.world.make import false_alarm
 from trackmdp.world.model import World
 from trackmdp.world.problem import Problem, modelled
 
@@ -318,7 +318,7 @@ def _believing(
     sensor = cfg.sensor
     assert isinstance(sensor, FalseAlarmConfig)
     # A trained policy's world is its run's, with the sensors asked for.
-    sensors = false_alarm(problem.size, p_d=sensor.p_d, p_f=sensor.p_f)
+    sensors = make(sensor, problem.size)
     world = modelled(problem, "sensor=false_alarm").but(safe_detection=1.0, **sensors)
     silent, alarmed = evaluate(world, policy), evaluate(world, policy, false_alarm=sensor.p_f)
     # A window is about the last located cell, and the filter is never sure of one.
