@@ -11,7 +11,8 @@ import numpy as np
 
 import trackmdp as tm
 from tests.helpers import headings
-from trackmdp.recordings.tracks import Tracks, ends_of
+from trackmdp.arrays.entries import ends_of
+from trackmdp.recordings.tracks import Tracks
 
 SHORT = {"total_frames": 4000, "frames_per_batch": 2000, "envs": 50}
 

@@ -20,9 +20,9 @@ from trackmdp.algos.estimates.censored import ObservedPaths, hidden_cells
 from trackmdp.algos.estimates.hidden_cells import Missed, redrawn
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.moves import known_as
-from trackmdp.arrays.entries import ones_at, row_index
+from trackmdp.arrays.entries import ends_of, ones_at, row_index
 from trackmdp.arrays.types import Array, BoolArray, IndexArray, Indices
-from trackmdp.recordings.tracks import Tracks, ends_of
+from trackmdp.recordings.tracks import Tracks
 from trackmdp.sensing.coverage import reported
 from trackmdp.sensing.task import Task
 from trackmdp.sensing.windows import Window

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
+from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray, Indices
 
 # Numbers of a matrix whose rows are added up as those of a dense one, 32 MB: kernels of up to 2,048 states.
 _SMALL = 2**22
@@ -25,14 +25,18 @@ def with_data(matrix: sparse.csr_array, data: AnyArray) -> sparse.csr_array:
     return sparse.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
 
 
+def index_type(count: int) -> type[np.int32] | type[np.int64]:
+    """int32 where it is enough: half the memory."""
+    return np.int32 if count <= np.iinfo(np.int32).max else np.int64
+
+
 def short_indices(matrix: sparse.csr_array) -> sparse.csr_array:
     """The same matrix with int32 indices, where they are enough: half the memory, and products read half as much.
 
     SciPy takes the widest integer among a matrix's parts, so that one array of int64 spreads to all.
     """
-    if max(*matrix.shape, matrix.nnz) > np.iinfo(np.int32).max:
-        return matrix
-    pointers = (each.astype(np.int32, copy=False) for each in (matrix.indices, matrix.indptr))
+    kind = index_type(max(*matrix.shape, matrix.nnz))
+    pointers = (each.astype(kind, copy=False) for each in (matrix.indices, matrix.indptr))
     return sparse.csr_array((matrix.data, *pointers), shape=matrix.shape)
 
 
@@ -70,6 +74,11 @@ def padded_rows(
     numbers = np.zeros(columns.shape)
     columns[place], numbers[place] = matrix.indices, matrix.data
     return columns, numbers
+
+
+def ends_of(lengths: Indices) -> Indices:
+    """`[K + 1]` where each of K rows of these lengths begins, end to end, and where the last one ends."""
+    return np.concatenate([[0], np.cumsum(lengths)])
 
 
 def block_rows(places: IndexArray, size: int) -> IndexArray:

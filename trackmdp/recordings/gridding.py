@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trackmdp.arrays.entries import ranks
+from trackmdp.arrays.entries import ends_of, ranks
 from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError
 from trackmdp.grid.place import Place, projected, projection
 from trackmdp.notebook.card import counted_words
 from trackmdp.recordings.positions import Positions
-from trackmdp.recordings.tracks import Tracks, ends_of
+from trackmdp.recordings.tracks import Tracks
 
 _WIDEST = 12.0
 """Degrees of longitude that one UTM zone, six degrees wide, is stretched over at most."""

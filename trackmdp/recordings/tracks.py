@@ -10,6 +10,7 @@ from typing import Unpack
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays.entries import ends_of
 from trackmdp.arrays.files import read_columns
 from trackmdp.arrays.types import Array, BoolArray, Indices
 from trackmdp.errors import UserError
@@ -298,11 +299,6 @@ def shuffled(names: Indices, seed: int) -> Indices:
     """The names, each once, in a random order."""
     names = np.unique(names)
     return names[np.random.default_rng(seed).permutation(len(names))]
-
-
-def ends_of(lengths: Indices) -> Indices:
-    """`[K + 1]` where each of K tracks of these lengths begins, end to end, and where the last one ends."""
-    return np.concatenate([[0], np.cumsum(lengths)])
 
 
 def _integers(source: str, name: str, column: Array) -> Indices:

@@ -12,23 +12,16 @@ from collections.abc import Iterator
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.entries import per_row, ranks
+from trackmdp.arrays.entries import ends_of, per_row, ranks
 from trackmdp.arrays.numbers import REAL
 from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.recordings.tracks import ends_of
 from trackmdp.solvers.evaluation import Evaluation, pooled
+from trackmdp.solvers.events import Events
 from trackmdp.solvers.linear import RenewalSystem
-from trackmdp.solvers.walk import (
-    Events,
-    Passed,
-    Step,
-    Walk,
-    all_events,
-    passed_last,
-    transition,
-)
+from trackmdp.solvers.mass import Passed, passed_last, transition
+from trackmdp.solvers.walk import Step, Walk, all_events
 from trackmdp.world.model import World
 from trackmdp.world.problem import Problem, modelled
 

@@ -21,10 +21,12 @@ from trackmdp.motion.chain import Motion
 from trackmdp.policies.table import PolicyTable
 from trackmdp.sensing.decisions import Decisions, sensing
 from trackmdp.sensing.task import Task
+from trackmdp.solvers.events import Events
 from trackmdp.solvers.linear import DIRECT_CELLS, TOLERANCE, RenewalSystem
+from trackmdp.solvers.mass import Passed, passed, passed_last
 from trackmdp.solvers.plans import Layout, Plans, Turn
 from trackmdp.solvers.value import event_groups, first_events, whole_renewals
-from trackmdp.solvers.walk import Events, Passed, Step, Walk, all_events, passed, passed_last
+from trackmdp.solvers.walk import Step, Walk, all_events
 from trackmdp.world.model import World
 
 _DIRECT = 1_500

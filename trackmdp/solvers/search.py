@@ -18,9 +18,9 @@ from typing import TypeAlias
 
 import numpy as np
 
+from trackmdp.arrays.entries import ends_of
 from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
 from trackmdp.policies.table import PolicyTable
-from trackmdp.recordings.tracks import ends_of
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.plans import Layout, Plans
 from trackmdp.solvers.renewal import Renewal

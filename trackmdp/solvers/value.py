@@ -25,6 +25,7 @@ from trackmdp.policies.table import PolicyTable, SetTable
 from trackmdp.recordings.tracks import Recorded, Tracks
 from trackmdp.sensing.task import Task
 from trackmdp.solvers.evaluation import Evaluation, ReplayedTracks, by_start, pooled
+from trackmdp.solvers.events import Events, detected_codes
 from trackmdp.solvers.linear import (
     DIRECT_CELLS,
     RenewalSystem,
@@ -33,15 +34,8 @@ from trackmdp.solvers.linear import (
     solve_onward,
     still_to_come,
 )
-from trackmdp.solvers.walk import (
-    Events,
-    Passed,
-    Walk,
-    all_events,
-    detected_codes,
-    passed,
-    passed_last,
-)
+from trackmdp.solvers.mass import Passed, passed, passed_last
+from trackmdp.solvers.walk import Walk, all_events
 from trackmdp.world.model import World
 from trackmdp.world.problem import Problem
 

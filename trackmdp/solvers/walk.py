@@ -1,12 +1,7 @@
 """Renewals: all that may happen from one detection to the next, for every world alike (theory.md#exact-value).
 
-An *event* is a pair (key, state) at a detection: the tracker's memory, and the hidden state of the target.
-Events are a Markov chain, also where the key forgets: the key determines the sets, and the state the future of the
-target. After an event the target moves once before each of t_max + 1 free choices, and once more before the safe
-action. A *step* lists the places where it may then be: entries (event, state).
-
-A safe action that misses is repeated, with D each time. So there are events of a second kind, the target missed by it
-in a state: they begin at the last step, the next safe action.
+After an event the target moves once before each of t_max + 1 free choices, and once more before the safe action. A
+*step* lists the places where it may then be: entries (event, state).
 
 On a line of four cells, where the target moves one cell to the right or stays in cell 3, events are cells, and
 
@@ -21,66 +16,18 @@ from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.arrays.entries import per_row
+from trackmdp.arrays.entries import ends_of, index_type, per_row
 from trackmdp.arrays.types import Array, BoolArray, IndexArray, Indices
 from trackmdp.memory.keys import KeySpace
 from trackmdp.motion.chain import Motion
-from trackmdp.recordings.tracks import ends_of
 from trackmdp.sensing.task import Task
+from trackmdp.solvers.events import Events, detected_codes, forced_codes
 
 _FEW = 2**14
 """States whose moves are gathered here: before SciPy looks at a single one, it takes a tenth of a millisecond."""
 _NONE = sparse.csr_array((0, 0))
-
-
-@dataclass(frozen=True, eq=False)
-class Events:
-    """All events that can occur, in order of (state, key); then the events of missed safe actions.
-
-    Attributes:
-        keys: the key space.
-        states: Z, of the motion.
-        codes: `[B]` sorted numbers: state · keys + key, and Z · keys more for a missed safe action.
-    """
-
-    keys: KeySpace
-    states: int
-    codes: Indices
-
-    @cached_property
-    def forced(self) -> int:
-        """Events of missed safe actions, the last ones."""
-        return len(self.codes) - int(np.searchsorted(self.codes, self.states * self.keys.num_keys))
-
-    @cached_property
-    def key(self) -> IndexArray:
-        """`[B]`."""
-        return np.asarray(self.codes % self.keys.num_keys)
-
-    @cached_property
-    def state(self) -> IndexArray:
-        """`[B]`."""
-        return np.asarray(self.codes // self.keys.num_keys % self.states)
-
-    @cached_property
-    def complete(self) -> bool:
-        """Whether the event of state z is event z: the key is a function of the state, and all states are there."""
-        return self.keys.order == 0 and len(self.codes) == self.states * (1 + (self.forced > 0))
-
-
-def detected_codes(keys: KeySpace, key: IndexArray, state: IndexArray) -> Indices:
-    """`[E]`, see `Events`."""
-    return state.astype(np.int64) * keys.num_keys + key
-
-
-def forced_codes(keys: KeySpace, states: int, key: IndexArray | None, state: IndexArray) -> Indices:
-    """`[E]`, see `Events`; what the next key does not depend on counts as 0, without `key` all of it."""
-    if key is not None and keys.order == 1:  # the next one depends on the last located cell alone
-        key = keys.start(keys.cell(key))
-    return (state.astype(np.int64) + states) * keys.num_keys + (0 if key is None else key)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +70,7 @@ class Step:
     def pointer(self) -> IndexArray:
         """`[B + 1]`, where the entries of each event begin, and where the last ones end."""
         ends = ends_of(np.bincount(self.rows, minlength=self.count))
-        return ends.astype(_width(len(self.rows)))
+        return ends.astype(index_type(len(self.rows)))
 
     def summed(self, values: Array) -> Array:
         """`[B]` sums of `values` `[E]` over the entries of each event."""
@@ -143,7 +90,7 @@ class Walk:
     def __init__(self, task: Task, motion: Motion, events: Events, *, closed: bool = True) -> None:
         self._task, self._motion, self._events, self._closed = task, motion, events, closed
         count = len(events.codes) - events.forced
-        self._rows: IndexArray = np.arange(count, dtype=_width(len(events.codes)))
+        self._rows: IndexArray = np.arange(count, dtype=index_type(len(events.codes)))
         self._states = events.state[:count]
         self._live: IndexArray | None = None
         self._n = 0
@@ -259,16 +206,11 @@ def _moves(
         every = np.zeros(shape[0], dtype=np.int64)
         every[live] = counts
     pointer = ends_of(every)
-    width = _width(max(len(data), *shape))
+    width = index_type(max(len(data), *shape))
     target = (
         np.arange(shape[1], dtype=width) if target is None else target.astype(width, copy=False)
     )
     return sparse.csr_array((data, target, pointer.astype(width, copy=False)), shape=shape)
-
-
-def _width(count: int) -> type[np.int32] | type[np.int64]:
-    """int32 where it is enough: half the memory."""
-    return np.int32 if count <= np.iinfo(np.int32).max else np.int64
 
 
 def all_events(
@@ -346,68 +288,3 @@ def _following(
             yield step.following
         if step.missed is not None:
             yield step.missed
-
-
-@dataclass(frozen=True)
-class Passed:
-    """One step of all B events at once.
-
-    Attributes:
-        located: `[B, B]`, probability that this step ends a renewal, and with which event.
-        totals: `[B, 6]`, expected reward, steps in the grid, detections, sensors on, safe actions and steps.
-    """
-
-    located: sparse.csr_array
-    totals: Array
-
-
-def passed(
-    task: Task,
-    step: Step,
-    mass: Array,
-    report: npt.NDArray[np.floating] | float,
-    spent: Array | float,
-    sensors: Array | float,
-) -> tuple[Passed, Array]:
-    """Carry undetected mass through a step.
-
-    Args:
-        task: its rewards.
-        step: the step.
-        mass: `[E_before]`, undetected before the move.
-        report: `[E]`, probability of a report there.
-        spent: `[B]`, price of the sensors on, or D for the safe action.
-        sensors: `[B]`, number of sensors on, or 0 for the safe action.
-
-    Returns:
-        The step of all events, and the mass `[E]` that is left undetected.
-    """
-    now = step.back @ mass
-    found = now * report
-    inside, located = step.summed(now), step.summed(found)
-    # Sensors are paid while the target is in the grid, whether or not it is where they look.
-    reward, forced = task.reward * located - spent * inside, step.n == task.num_choices
-    length = per_row(step.before, mass if step.goes_on is None else mass * step.goes_on, step.count)
-    figures = [reward, inside, located, sensors * inside, forced * inside, length]
-    onward = transition(found, step.pointer, step.following)
-    if step.missed is not None:
-        onward = onward + transition(now - found, step.pointer, step.missed)
-    # Figure by figure in memory: put together, and summed over steps, five times as fast as event by event.
-    return Passed(onward, np.array(figures).T), now - found
-
-
-def passed_last(task: Task, motion: Motion, step: Step, mass: Array) -> Passed:
-    """The safe action after the free choices, which leave `mass` `[E_before - begun]` undetected; see `passed`."""
-    mass = np.concatenate([mass, np.ones(step.begun)])
-    report = 1.0 if task.safe else task.safe_detection[motion.cell[step.states]]
-    return passed(task, step, mass, report, task.safe_cost, 0.0)[0]
-
-
-def transition(value: Array, pointer: IndexArray, columns: IndexArray) -> sparse.csr_array:
-    """`[B, B]` of entries `[E]` in order of their rows, which begin at `pointer`; those of 0 are left out."""
-    count = len(pointer) - 1
-    some = np.flatnonzero(value > 0)
-    if len(some) < len(value):
-        value, columns, pointer = value[some], columns[some], np.searchsorted(some, pointer)
-    parts = (each.astype(_width(len(value)), copy=False) for each in (columns, pointer))
-    return sparse.csr_array((value, *parts), shape=(count, count))

@@ -21,8 +21,9 @@ from trackmdp.policies.table import SetTable
 from trackmdp.recordings.tracks import Tracks
 from trackmdp.sensing.task import Task
 from trackmdp.solvers.linear import solve_onward
+from trackmdp.solvers.mass import Passed
 from trackmdp.solvers.renewal import Act, Renewal
-from trackmdp.solvers.walk import Passed, all_events
+from trackmdp.solvers.walk import all_events
 
 
 @dataclass(frozen=True)
