@@ -16,9 +16,6 @@ A sensor that is on misses a share 1 - p_d(j) of its mass. Sensing j is then wor
 
 Where `delayed` has tables, complete sets are bounded by positions revealed one move late as well.
 
-The loss against revealing at once is superadditive, so the joint loss of two cells, when both are left, bounds the loss
-of any set of undecided cells (`Tree._least_loss`).
-
 Cells are decided one by one, the likeliest first; open choices are kept best first in batches, so that all the
 arithmetic is on arrays and sparse rows.
 """
@@ -38,17 +35,15 @@ from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.solvers.certify.choices import Choices, Frontier, LeftOut, Origin, sets_left_out
 from trackmdp.solvers.certify.delayed import Delayed
 from trackmdp.solvers.certify.inner import InnerProblem
-from trackmdp.solvers.certify.joint import Joint
+from trackmdp.solvers.certify.losses import Losses
 
 # Choices under one heap entry: enough of them for array arithmetic to pay, and not so many that poor ones are expanded
 # along with the best one, which gives the batch its place in the heap.
 LARGEST_BATCH = 4096
 # Complete choices that go on to the next step together.
 ENOUGH = 1024
-# Finite on purpose: regrets are summed and their maximum is taken out again (`_least_loss`), and inf - inf is nan.
+# Finite on purpose: regrets are summed and their maximum is taken out again (`Losses`), and inf - inf is nan.
 FORBIDDEN = 1e30
-MOST_PAIRED = 10
-"""Cells of one state up to which every pair is looked at for a better bound."""
 
 
 class Tree:
@@ -79,10 +74,9 @@ class Tree:
             delayed: bounds on complete sets, at least as tight as `revealed`.
         """
         self._world = problem.world
-        self._detected = problem.detected
         self._windowed = problem.windowed
         self._revealed, self._slack, self._delayed = revealed, slack, delayed
-        self._joint = Joint(problem.world, problem.detected, revealed)
+        self._losses = Losses(problem, revealed)
         self.best = lower.copy()
         self.nodes = 0
         # Problem -> cells left unsensed at each step, for the problems with a better plan than `lower`.
@@ -141,12 +135,11 @@ class Tree:
         frontier = choices.frontier
         before = known.get(id(frontier))
         if before is None:
-            origin = frontier.origin
             before = np.zeros(len(frontier.start))
-            for number, batch in enumerate(origin.batches if origin is not None else ()):
-                assert origin is not None
-                mine = origin.batch == number
-                before[mine] = self._paid(batch, paid, known)[origin.place[mine]]
+            if (origin := frontier.origin) is not None:
+                for number, batch in enumerate(origin.batches):
+                    mine = origin.batch == number
+                    before[mine] = self._paid(batch, paid, known)[origin.place[mine]]
             if frontier.missed is not None:
                 before = before + frontier.missed @ paid
             known[id(frontier)] = before
@@ -165,19 +158,14 @@ class Tree:
 
     def improvements(self) -> tuple[BoolArray, list[LeftOut]]:
         """`[B]` which problems have found a better plan, and the cells that it leaves unsensed at each step."""
-        better = np.zeros(len(self.best), dtype=bool)
-        better[list(self._leaves)] = True
-        found = []
+        better, found = np.zeros(len(self.best), dtype=bool), []
+        problems = np.array(list(self._leaves), dtype=np.int64)
+        better[problems] = True
         for t in range(len(self._revealed)):
             cells = [plan[t] for plan in self._leaves.values()]
-            rows = np.repeat(
-                np.array(list(self._leaves), dtype=np.int64), [len(left) for left in cells]
-            )
-            found.append(
-                LeftOut.of(
-                    rows, np.concatenate([[], *cells]).astype(np.int64), self._world.num_cells
-                )
-            )
+            rows = np.repeat(problems, [len(left) for left in cells])
+            left = np.concatenate([[], *cells]).astype(np.int64)
+            found.append(LeftOut.of(rows, left, self._world.num_cells))
         return better, found
 
     def _decide(self, choices: Choices) -> None:
@@ -193,7 +181,7 @@ class Tree:
         if not len(split.state):
             return
         self.nodes += 2 * len(split.state)
-        raw, added = self._losses(split)
+        raw, added = self._losses.of(split)
         regret = frontier.regret[split.state, k]
         # Each undecided cell costs its regret or its added loss; `together` takes the better of the two for all.
         least = np.minimum(frontier.regret[split.state, k:], added)
@@ -210,135 +198,26 @@ class Tree:
             bound = np.minimum(split.bound, np.minimum(apart, together - (paid - least[:, 0])))
             self._push(Choices(frontier, k + 1, split.state, cells, relaxed, lost, bound))
 
-    def _losses(self, choices: Choices) -> tuple[Array, Array]:
-        """`[P]` joint loss of the cells left, `[P, K - k]` the addition of each undecided cell if it is left."""
-        frontier, k = choices.frontier, choices.decided
-        lost = choices.lost.copy()
-        added = np.zeros((len(choices.state), frontier.cells.shape[1] - k))
-        some = np.flatnonzero(choices.left.any(axis=1))
-        if not len(some):
-            return lost, added
-        if frontier.after is None:
-            lost[some] = self._joint_loss(choices.pick(some))
-            return lost, added
-        of = frontier.after, frontier.sets_left - 1
-        lost[some], added[some] = self._joint.losses(
-            *of, choices.state[some], choices.left[some], k
-        )
-        return lost, added
-
-    def _joint_loss(self, choices: Choices) -> Array:
-        """`[P]` lower bound on the loss of leaving the cells left unsensed against revealing the position at once."""
-        return self._loss(self._left_mass(choices), choices.frontier.sets_left - 1)
-
-    def _loss(self, mass: sparse.csr_array, sets_left: int) -> Array:
-        """`[P]` worth of `mass` with the position revealed at once, less its bound with one more set before that."""
-        # Revealed at once, the mass is worth sum_j z_j R(e_j); one set for all, revealed only then, is worth less:
-        # with z = (.2 at a, .2 at b) and the target going on to c from either, one sensor at c serves both; if it goes
-        # on to different cells, two sensors are paid for .4 of mass in place of one each for .2.
-        return np.maximum(
-            mass @ self._revealed[sets_left] - self._one_more_set(mass, sets_left)[0], 0.0
-        )
-
-    def _least_loss(self, frontier: Frontier) -> Array:
-        """`[B, K + 1]` lower bound on the loss against `relaxed` of the cells from the k-th on, however decided.
-
-        A cell sensed costs its regret. Two or more cells left unsensed lose, F being sublinear, at least the sum over
-        them of half the smallest loss of a pair with that cell. With one or none left, all others cost their regret.
-        """
-        count, width = len(frontier.start), frontier.cells.shape[1]
-        if not 2 <= width <= MOST_PAIRED:
-            return np.zeros((count, width + 1))
-        # pair[s, a, b]: joint loss of cells a and b of state s when both are left; infinite where one is padding
-        pair = np.full((count, width, width), np.inf)
-        for shift in range(1, width):
-            state, place = np.nonzero(np.arange(shift, width) < frontier.count[:, None])
-            lost = self._pair_loss(frontier, state, place, place + shift)
-            pair[state, place, place + shift] = pair[state, place + shift, place] = lost
-        rest = np.zeros((count, width + 1))
-        present = np.arange(width) < frontier.count[:, None]
-        for k in range(width):
-            # Each cell from the k-th on costs its regret, or is left together with another one. Averaging over all
-            # pairings of the cells left, cell a takes at least half of its cheapest pair's loss.
-            # That holds where two or more are left; with one or none, all the others cost their regret.
-            later = pair[:, k:, k:].min(axis=2)
-            regret = np.where(present[:, k:], frontier.regret[:, k:], 0.0)
-            # Why half, with n cells left: z_N is 1/(n-1) times the sum of its pairs, and the loss is superadditive and
-            # homogeneous, so loss(z_N) >= 1/(n-1) sum over pairs of loss(a, b) >= sum over a of min_b loss(a, b) / 2.
-            several = np.where(present[:, k:], np.minimum(later / 2.0, regret), 0.0).sum(axis=1)
-            # One cell left: all others cost their regret, at best all but the largest.
-            rest[:, k] = np.minimum(several, regret.sum(axis=1) - regret.max(axis=1))
-        return rest
-
-    def _pair_loss(
-        self, frontier: Frontier, state: IndexArray, a: IndexArray, b: IndexArray
-    ) -> Array:
-        cells = np.stack([frontier.cells[state, a], frontier.cells[state, b]], axis=1)
-        masses = np.stack([frontier.mass[state, a], frontier.mass[state, b]], axis=1)
-        # CSR rows of exactly two entries each: row p is entries 2p and 2p + 1.
-        pointer = np.arange(len(state) + 1) * 2
-        mass = sparse.csr_array(
-            (masses.ravel(), cells.ravel(), pointer), shape=(len(state), self._world.num_cells)
-        )
-        return self._loss(mass, frontier.sets_left - 1)
-
-    def _left_mass(self, choices: Choices) -> sparse.csr_array:
-        _, cells, mass = choices.left_cells()
-        pointer = np.concatenate([[0], np.cumsum(choices.left.sum(axis=1))])
-        shape = (len(choices.left), self._world.num_cells)
-        unsensed = sparse.csr_array((mass, cells, pointer), shape=shape)
-        missed = choices.frontier.missed
-        return unsensed if missed is None else unsensed + missed[choices.state]
-
-    def _one_more_set(
-        self, mass: sparse.csr_array, sets_left: int
-    ) -> tuple[Array, sparse.csr_array, Array, Array]:
-        """Upper bound of F on each row of `mass` `[P, M]`: one more set for all of it, then the position is revealed.
-
-        Returns:
-            `[P]` the bound; `[P, M]` the mass after the move; and per stored entry of it, the worth of sensing the cell
-            and of leaving it.
-        """
-        # Row q of `mass` [P, M] is a vector of undetected mass, `moved` is q P. Revealed after this set, each cell
-        # counts by itself, m_j (p_d (r + V(j)) + (1 - p_d) R_{h-1}(j)) - c_j |m| or m_j R_{h-1}(j), and the best set
-        # takes the larger one cell by cell.
-        moved = mass @ self._world.kernel
-        rows, cells = row_index(moved), moved.indices
-        detected, missed = self._detected[cells], self._revealed[sets_left - 1][cells]
-        worth = detected - (1.0 - self._world.detects(cells)) * (detected - missed)
-        sense = (
-            moved.data * worth
-            - self._world.prices[cells] * per_row(rows, moved.data, mass.shape[0])[rows]
-        )
-        leave = moved.data * missed
-        return per_row(rows, np.maximum(sense, leave), mass.shape[0]), moved, sense, leave
-
     def _advance(self, batches: list[Choices]) -> None:
         """The sets of these choices are complete: go on to the next step, or value the chain if there is none."""
         batches = [each.pick(self._hopeful(each.start, each.bound)) for each in batches]
         if not any(len(each.state) for each in batches):
             return
         sets_left = batches[0].frontier.sets_left - 1
-        mass = sparse.vstack([self._left_mass(each) for each in batches], format="csr")
+        mass = sparse.vstack([each.left_mass() for each in batches], format="csr")
         earned = (
             np.concatenate([each.relaxed for each in batches]) - mass @ self._revealed[sets_left]
         )
         # `relaxed` counted the cells left at their revealed worth; that is taken out and the rest searched for anew
         most = np.concatenate([each.bound for each in batches])
         if self._delayed is not None and sets_left > 1:
-            most = np.minimum(
-                most, earned + np.concatenate([self._left_worth(each) for each in batches])
-            )
+            worth = [
+                self._delayed.worth(each.frontier.before[each.state], each.left_out(), sets_left)
+                for each in batches
+            ]
+            most = np.minimum(most, earned + np.concatenate(worth))
         start = np.concatenate([each.start for each in batches])
         self._open(start, earned, mass, sets_left, most, Origin.of(batches))
-
-    def _left_worth(self, choices: Choices) -> Array:
-        """`[P]` upper bound on the worth of the mass that complete `choices` leave undetected."""
-        assert self._delayed is not None
-        row, cells, _ = choices.left_cells()
-        left = LeftOut.of(row, cells, self._world.num_cells)
-        before = choices.frontier.before[choices.state]
-        return self._delayed.worth(before, left, choices.frontier.sets_left - 1)
 
     def _open(
         self,
@@ -353,7 +232,7 @@ class Tree:
 
         `most` `[P]` bounds the worth of a plan that goes on from them, with the reward `earned` so far.
         """
-        _, moved, sense, leave = self._one_more_set(mass, sets_left)
+        _, moved, sense, leave = self._losses.one_more_set(mass, sets_left)
         rows = row_index(moved)
         sense = self._within(start[rows], moved.indices, sense)
         relaxed = earned + per_row(rows, np.maximum(sense, leave), len(start))
@@ -368,13 +247,10 @@ class Tree:
         frontier = Frontier.of(start, sets_left, relaxed, mass, found, leave - sense, kept, origin)
         if not self._world.perfect:
             frontier = replace(frontier, missed=(moved - found)[kept])
-        present = np.arange(frontier.cells.shape[1]) < frontier.count[:, None]
-        at = frontier.cells, frontier.mass, present
-        after = self._joint.next(*at) if self._world.perfect else None
-        frontier = replace(frontier, rest=self._least_loss(frontier), after=after)
+        frontier = self._losses.looked_ahead(frontier)
         first = Choices.undecided(frontier, frontier.relaxed - frontier.rest[:, 0])
         if frontier.missed is not None:  # the missed mass has this loss under every choice
-            lost = self._joint_loss(first)
+            lost = self._losses.joint(first)
             first = replace(first, lost=lost, bound=first.bound - lost)
         self._push(replace(first, bound=np.minimum(first.bound, most[kept])))
 

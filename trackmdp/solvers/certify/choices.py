@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.entries import among, ranks, row_index
+from trackmdp.arrays.entries import among, ends_of, ranks, row_index
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.solvers.certify.joint import Next
 
@@ -42,6 +42,11 @@ class Frontier:
     origin: Origin | None
     missed: sparse.csr_array | None = None
     after: Next | None = None
+
+    @property
+    def present(self) -> BoolArray:
+        """`[B, K]`, the cells that are not padding."""
+        return np.arange(self.cells.shape[1]) < self.count[:, None]
 
     @classmethod
     def of(
@@ -109,6 +114,19 @@ class Choices:
         row, place = np.nonzero(self.left)
         state = self.state[row]
         return row, self.frontier.cells[state, place], self.frontier.mass[state, place]
+
+    def left_mass(self) -> sparse.csr_array:
+        """`[P, M]`, undetected mass after the set."""
+        _, cells, mass = self.left_cells()
+        shape = (len(self.left), self.frontier.before.shape[1])
+        unsensed = sparse.csr_array((mass, cells, ends_of(self.left.sum(axis=1))), shape=shape)
+        missed = self.frontier.missed
+        return unsensed if missed is None else unsensed + missed[self.state]
+
+    def left_out(self) -> LeftOut:
+        """The same cells, by choice."""
+        row, cells, _ = self.left_cells()
+        return LeftOut.of(row, cells, self.frontier.before.shape[1])
 
     def pick(self, kept: IndexArray | BoolArray) -> Choices:
         """The choices `kept`, of the same states."""

@@ -1,7 +1,7 @@
 """Joint loss of cells left unsensed, decided on or undecided: the bound inside branch and bound.
 
 Let D be the cells left unsensed and U those still undecided, z the undetected mass. One more set for all of it, then
-the position revealed, is worth at most (`Tree._one_more_set`)
+the position revealed, is worth at most (`Losses.one_more_set`)
 
     sum_j z_j rho_j + sum_i max{0, sum_j z_j b_ji},   b_ji = P_ji w_i - c_i p_in(j),   w_i = r + V(i) - R(i),
 
