@@ -29,7 +29,7 @@ from trackmdp.sensing.task import Task
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.display import make_console
-from trackmdp.training.folders import read_summary, write_summary
+from trackmdp.training.folders import read_summary, run_of, write_summary
 from trackmdp.training.lock import locked
 from trackmdp.training.run import load_run
 from trackmdp.world.configured import build_world
@@ -133,6 +133,14 @@ def test_a_run_by_blocks_is_one_run_that_needs_no_curve(tmp_path: Path) -> None:
         assert found.anomalies == []
 
 
+def test_a_run_that_failed_in_the_sweep_and_was_ended_by_hand_counts(sweep: Path) -> None:
+    write_json(sweep / "a2c-0.22-1/failed.json", {"reason": "out of luck"})
+    assert run_of(sweep / "a2c-0.22-1").state == "done"
+    found = gather_runs(sweep)
+    assert "a2c-0.22-1" in {run.name for run in found.runs}
+    assert "a2c-0.22-1" not in reasons(found)
+
+
 def test_faults_of_a_run_are_listed(sweep: Path) -> None:
     (sweep / "a2c-0.16-0/summary.json").unlink()
     (sweep / "a2c-0.16-1/summary.json").write_text('{"frames": 3')
@@ -140,6 +148,8 @@ def test_faults_of_a_run_are_listed(sweep: Path) -> None:
     (sweep / "a2c-0.22-0/config.yaml").write_text("a: [")
     write_json(sweep / "a2c-0.22-1/failed.json", {"reason": "out of luck"})
     (sweep / "a2c-0.22-2/failed.json").write_text("{")
+    for seed in (1, 2):
+        (sweep / f"a2c-0.22-{seed}/summary.json").unlink()
     for seed in range(3):
         (sweep / f"hindsight-0.22-{seed}/policy.npz").write_bytes(b"nothing")
     (sweep / "hindsight-0.16-0/problem.npz").unlink()

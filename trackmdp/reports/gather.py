@@ -94,7 +94,8 @@ def _read(place: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]]:
     Raises:
         UserError: the run failed, is not finished, or cannot be read.
     """
-    if (place / FAILED_FILE).is_file():
+    # With a summary it was ended by hand since.
+    if (place / FAILED_FILE).is_file() and not (place / SUMMARY).is_file():
         reason = known_object(place / FAILED_FILE).get("reason", "no reason given")
         raise UserError(f"failed: {reason}")
     if not (place / "config.yaml").is_file():
