@@ -69,9 +69,8 @@ def prepare(command: str, composed: DictConfig, words: Sequence[str]) -> Prepare
     if not resumes:
         refuse_ignored(cfg, by_key(words))
     prepared = check(command, cfg, folder_of(composed, "hydra.run.dir"), words)
-    # A run that goes on has a config of its own, which `check` has compared with the words.
-    if resumes and not (prepared.folder / "config.yaml").is_file():
-        refuse_ignored(cfg, by_key(words))
+    if resumes:  # a run that goes on has a config of its own
+        refuse_ignored(prepared.cfg, by_key(words))
     return prepared
 
 
