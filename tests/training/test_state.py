@@ -112,6 +112,31 @@ def test_a_checkpoint_that_is_named_is_taken_or_refused(
     assert_same_run(half, whole)
 
 
+def test_checkpoints_after_a_named_one_are_not_gone_on_from(
+    half: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen = half / "checkpoints" / "iteration-00000003.pt"
+    assert checkpoint.newest(half) > chosen
+    with monkeypatch.context() as patch:
+        at_iteration(patch, 4, breaks)
+        assert typed(half, f"resume={chosen}") == 1
+    assert checkpoint.newest(half) == chosen
+    assert typed(half, "resume=auto") == 0
+    assert_same_run(half, whole)
+
+
+def test_checkpoints_of_another_run_behind_a_link_stay(tmp_path: Path) -> None:
+    folder, theirs = tmp_path / "run", tmp_path / "theirs"
+    for each in (folder, theirs):
+        each.mkdir()
+    file = theirs / "iteration-00000009.pt"
+    file.write_bytes(b"theirs")
+    (folder / "checkpoints").symlink_to(theirs)
+    with pytest.raises(UserError, match="a link or a file"):
+        train(folder)
+    assert list(theirs.iterdir()) == [file]
+
+
 def test_no_run_starts_anew_where_every_checkpoint_is_damaged(
     half: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -140,6 +165,13 @@ def test_another_option_is_refused(
     before = files(half)
     assert typed(half, "resume=auto", word) == 2
     assert capsys.readouterr().err == f"trackmdp train: {told}; it cannot change on resume\n"
+    assert files(half) == before
+
+
+def test_a_change_without_effect_is_refused(half: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = files(half)
+    assert typed(half, "resume=auto", "partition.workers=2") == 2
+    assert "partition.workers=2: without effect" in capsys.readouterr().err
     assert files(half) == before
 
 
