@@ -41,6 +41,15 @@ def test_a_revealed_mode_is_worth_more_than_any_memory() -> None:
     assert again.aihtr == pytest.approx(remembered.lower)
 
 
+def test_a_bracket_of_one_number_is_not_turned_round_by_rounding() -> None:
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        kernel = rng.permutation(np.eye(6)) * rng.uniform(0.9, 0.999, (6, 1))
+        best = solve(World(kernel, (1, 3), cost=0.2, modes=2, reveals=True))
+        assert best.certified
+        assert best.lower <= best.upper
+
+
 @pytest.mark.usefixtures("little_search")
 def test_the_bound_holds_for_every_memory_and_memory_pays() -> None:
     cell, more = (

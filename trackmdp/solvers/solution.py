@@ -47,7 +47,7 @@ class Solution(Carded):
     def card(self) -> Card:
         """The bracket and the figures of the policy."""
         task = self.table.task
-        gap = max(0.0, self.upper - self.lower)
+        gap = self.upper - self.lower
         facts = {
             f"{self.title} AIHTR": decimal(self.lower, 4),
             "upper bound": f"{decimal(self.upper, 4)}; {self.ended}, gap {gap:.2g}",
@@ -92,7 +92,8 @@ class Solution(Carded):
     @property
     def upper(self) -> float:
         """No policy has a higher AIHTR."""
-        return float(self.bound.mean())
+        # Means of the same numbers in another order differ in the last bit.
+        return max(float(self.bound.mean()), self.lower)
 
 
 @dataclass(frozen=True)

@@ -50,11 +50,6 @@ class Corner(Solution):
         """Detections per step in the grid, forced ones included."""
         return self.evaluation.accuracy
 
-    @property
-    def upper(self) -> float:
-        """No policy has a higher AIHTR at this price."""
-        return max(super().upper, self.lower)
-
 
 @dataclass(frozen=True)
 class Mixture:
