@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from tests.solvers.worlds import best_of_all, searched, tiny_worlds
 from trackmdp.arrays.types import BoolArray
+from trackmdp.config.sensors import LARGEST_PRICE
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import exchange, optimal, search
 from trackmdp.solvers.certify.inner import InnerProblem
@@ -183,6 +184,12 @@ def test_other_starts_are_led_by_other_prices_and_end_higher() -> None:
     assert any((one != other).any() for one, other in zip(*first, strict=True))
     values = [evaluate(world, exchange.solve(world, starts)).aihtr for starts in (0, 4)]
     assert values[1] > values[0] + 1e-3
+
+
+def test_other_starts_have_prices_in_range() -> None:
+    world = World(np.full((4, 4), 0.2), 2, cost=LARGEST_PRICE)
+    found = list(exchange.other_starts(Renewal(world, world.motion), 4))
+    assert not any(on.any() for sets in found for on in sets)
 
 
 def test_without_a_free_choice_after_the_first_there_is_nothing_to_exchange() -> None:

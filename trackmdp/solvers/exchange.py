@@ -23,6 +23,7 @@ from scipy import sparse
 
 from trackmdp.arrays.entries import ranks
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
+from trackmdp.config.sensors import LARGEST_PRICE
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers.bounds import one_set
@@ -96,7 +97,7 @@ def other_starts(
     world, rng = renewal.world, np.random.default_rng(derive(0, "exchange", "starts"))
     for _ in range(count if world.num_cells <= MOST_STARTED else 0):
         off = np.exp(PRICES_OFF * rng.standard_normal(world.total_sensors))
-        other = replace(world, cost=world.cost * off)
+        other = replace(world, cost=np.minimum(world.cost * off, LARGEST_PRICE))
         changed = renewal.priced_as(other)
         first = Found(changed, clocked_sets(changed))
         yield follow_credit(first, steps, sweeps).sets
