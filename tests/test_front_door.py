@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import doctest
+import importlib
 import inspect
 import json
 import subprocess
@@ -78,6 +80,21 @@ def test_every_name_is_there_and_says_what_it_is(name: str) -> None:
     assert name in dir(tm)
     assert inspect.getdoc(found)
     assert found.__module__ == tm._HOMES[name]
+
+
+PACKAGE = Path(tm.__file__).parent
+WITH_EXAMPLES = [
+    ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
+    for path in sorted(PACKAGE.rglob("*.py"))
+    if ">>>" in path.read_text()
+]
+
+
+@pytest.mark.parametrize("module", WITH_EXAMPLES)
+def test_examples_in_docstrings_print_their_output(module: str) -> None:
+    found = doctest.testmod(importlib.import_module(module))
+    assert found.attempted
+    assert not found.failed
 
 
 def test_type_checkers_see_the_same_names() -> None:

@@ -14,7 +14,9 @@ from trackmdp.training.callbacks import Position
 from trackmdp.training.display import Display
 
 
-def shown(width: int, *, terminal: bool, frames: int = 1_000_000) -> list[str]:
+def shown(
+    width: int, *, terminal: bool, frames: int = 1_000_000, aihtr: float = -2985.0
+) -> list[str]:
     """The lines that are printed for a run of so many frames, collected in 4 s."""
     out = io.StringIO()
     console = Console(
@@ -25,7 +27,7 @@ def shown(width: int, *, terminal: bool, frames: int = 1_000_000) -> list[str]:
     )
     display = Display(console, "hindsight seed 12")
     display.on_start(trainer)
-    trainer.score = SimpleNamespace(evaluation=SimpleNamespace(aihtr=-2985.0))
+    trainer.score = SimpleNamespace(evaluation=SimpleNamespace(aihtr=aihtr))
     trainer.position, trainer.collecting = (
         Position(iteration=10, frames=frames, seconds=50.0),
         4.0,
@@ -55,3 +57,9 @@ def test_frames_per_second_are_those_of_collecting(terminal: bool) -> None:
 def test_a_run_that_collects_no_more_has_no_speed() -> None:
     """As one resumed while it learns from its buffer alone."""
     assert any("0 frames AIHTR -2,985.00" in line for line in shown(160, terminal=False, frames=0))
+
+
+def test_a_value_at_the_bound_has_no_gap_below_zero() -> None:
+    # the solver's rounding may lie on either side of the bound
+    lines = shown(160, terminal=False, aihtr=117.25 + 1e-12)
+    assert any("AIHTR 117.25 gap 0.00" in line for line in lines)

@@ -214,7 +214,7 @@ def _clocked(world: World, *, exact: bool) -> ClockedBound:
             break
         choices, table = improved, candidate
     # Iterated solves leave Û off by a little, and so do linear programs; with rho the excess of one improvement step
-    # over Û, and at most `longest` steps to collect it on, U <= Û + longest * rho (theory.md#bounds).
+    # over Û, and L the expected steps from each cell, U <= Û + rho max L (theory.md#bounds).
     error = 0.0
     if not (solved and world.coverage is None):
         excess = float((_one_step(world, table, exact=exact) - table).max())

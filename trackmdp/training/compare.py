@@ -131,7 +131,7 @@ def compare(problem: Subject, policies: Mapping[str, Any] | Sequence[Any]) -> Co
         >>> from trackmdp import Policy, make_world
         >>> world = make_world(size=3)
         >>> compare(world, ["all_on", Policy.none(world)]).sentences
-        ['Policy 2 earns 1,071.000 more per episode than all_on (exact).']
+        ['Policy 2 earns 58.520 more per episode than all_on (exact).']
     """
     check_problem(problem, "compare")
     if isinstance(policies, str) or not isinstance(policies, Iterable):

@@ -16,7 +16,7 @@ from rich.status import Status
 from rich.table import Table
 from rich.text import Text
 
-from trackmdp.notebook.card import counted_words
+from trackmdp.notebook.card import counted_words, decimal
 from trackmdp.signals import handled, stop
 from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.untrusted import printable
@@ -97,7 +97,7 @@ class Display(Callback):
         figures = f"{at.frames:,} frames{rate} AIHTR {aihtr:,.2f}"
         gap = trainer.evaluator.upper - aihtr
         if not math.isnan(gap):  # no upper bound is known on recorded tracks
-            figures += f" gap {gap:,.2f}"
+            figures += f" gap {decimal(gap, 2)}"
         if self._bar is not None:
             self._bar.update(self._task, completed=at.iteration, figures=figures)
         elif not self._console.quiet:

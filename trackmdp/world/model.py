@@ -30,9 +30,11 @@ class World(Task):
 
     Args:
         kernel: `[Z, Z]` table of P, sparse or dense, Z = M · modes.
-        size: see `Task`, as are all further arguments.
+        size: N of an N x N grid, or (rows, columns).
         modes: H, modes of the target in each cell, such as headings or regimes.
         reveals: whether a detection reveals the mode as well (Doppler, AIS).
+        **of_task: `cost`, always needed; `t_max`, `safe_cost`, `reward`, `max_steps`, `window`, `budget`, `detection`,
+            `safe_detection`, `coverage`, `memory`, `clip`, `place`: attributes of `trackmdp.sensing.task.Task`.
 
     Attributes:
         kernel: `[Z, Z]` canonical CSR matrix of float64, without explicit zeros; row z sums to 1 - p_exit(z).
