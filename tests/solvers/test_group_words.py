@@ -17,7 +17,9 @@ from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.several import group_value
+from trackmdp.solvers.several.merging import make_rule
 from trackmdp.world.group import Group
+from trackmdp.world.model import World
 
 
 @pytest.mark.parametrize(
@@ -93,6 +95,24 @@ def test_other_targets_and_policies_are_refused() -> None:
         evaluate(world, "none", merge="gains")  # type: ignore[call-overload]
     with pytest.raises(UserError, match="expected gains with a budget"):
         evaluate(Group([world.but(budget=1)] * 2), "none", merge="union")
+
+
+def test_plans_go_with_their_motions_to_other_targets() -> None:
+    one, other = tiny(1), World.of(tiny(1), tiny(2).kernel)
+    both = Group([one, other])
+    found, alone = tm.solve(both), tm.solve(Group([one]))
+    own = dict(zip(both.kinds, found.tables, strict=True))
+    for worlds in ([other, one], [one, one], [other]):
+        targets = Group(worlds)
+        for merge in ("gains", "union"):
+            rule = make_rule(targets, [own[kind] for kind in targets.kinds], merge)
+            for policy in (found, found.policy):
+                mine = evaluate(targets, policy, merge=merge)
+                assert mine.aihtr == evaluate(targets, rule).aihtr
+    with pytest.raises(UserError, match="policy: number of plans 1, expected 2"):
+        evaluate(both, alone)
+    with pytest.raises(UserError, match="policy: for 2 targets, expected one for a single target"):
+        tm.simulate(one, found.policy, 2)  # type: ignore[call-overload]
 
 
 def test_commands_solve_and_evaluate_with_several_targets(tmp_path: Path) -> None:

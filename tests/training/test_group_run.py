@@ -139,6 +139,12 @@ def test_a_network_is_shown_the_last_sets_in_simulations_and_by_a_tracker() -> N
         tracker.report([None, None])
 
 
+def test_a_network_that_reads_all_targets_is_not_merged() -> None:
+    rule = JointRule(group(), Alternating(), torch.device("cpu"))
+    with pytest.raises(UserError, match="merge=union: expected none, as the policy is of all"):
+        evaluate(rule.group, rule, merge="union")
+
+
 @pytest.mark.parametrize("merge", ["gains", "union"])
 def test_one_targets_plan_is_learned_and_merged(merge: str, tmp_path: Path) -> None:
     words = {"total_frames": 4096, "frames_per_batch": 2048, "envs": 64}

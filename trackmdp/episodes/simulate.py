@@ -86,6 +86,10 @@ def simulate(
         policy = group_rule(problem, policy, **of_group)
     elif of_group:
         raise UserError(f"{min(of_group)}: an option of several targets, expected none with one")
+    elif isinstance(policy, Rule):
+        raise UserError(
+            f"policy: for {len(policy.group)} targets, expected one for a single target"
+        )
     elif isinstance(policy, str):
         policy = named_policy(problem, policy)
 

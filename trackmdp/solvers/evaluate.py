@@ -87,15 +87,21 @@ def _of_group(
 
 
 def group_rule(group: Group, policy: Any, merge: str | None = None) -> Rule:
-    """A policy for several targets: itself, or the merged plans of single ones."""
-    if isinstance(policy, Rule):
-        return policy.within(group)
-    if (tables := getattr(policy, "tables", None)) is None:
-        if isinstance(held := getattr(policy, "policy", None), Rule):
-            return held.within(group)
+    """A policy for several targets: itself, or the merged plans of single ones.
+
+    Raises:
+        UserError: plans are of other motions, or a policy that was learned for all targets is to be merged.
+    """
+    held = policy if isinstance(policy, Rule) else getattr(policy, "policy", None)
+    if not isinstance(held, Rule):
         singles = [group.single] if group.recorded else group.kinds
-        tables = [_table(each, policy) for each in singles]
-    return make_rule(group, tables, merge)
+        return make_rule(group, [_table(each, policy) for each in singles], merge)
+    rule = held.within(group)
+    if merge in (None, rule.name):
+        return rule
+    if not rule.tables:
+        raise UserError(f"merge={merge}: expected none, as the policy is of all targets together")
+    return make_rule(group, rule.tables, merge)
 
 
 def _table(problem: Problem, policy: PolicyLike | Array | BoolArray) -> PolicyTable:

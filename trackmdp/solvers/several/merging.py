@@ -148,6 +148,10 @@ class Rule(ABC):
         self.group, self.tables = group, tuple(tables)
         self.task = group.task
         self.cells = self.task.num_cells
+        if tables and len(tables) != len(group.kinds):
+            raise UserError(
+                f"policy: number of plans {len(tables)}, expected {len(group.kinds)}, one for each motion"
+            )
         for table in tables:
             table.check_fits(self.task)
             if not table.deterministic or table.task.keyed:
@@ -156,8 +160,12 @@ class Rule(ABC):
                 )
 
     def within(self, group: Group) -> Rule:
-        """The same policy for other targets of the same task."""
-        return self if group is self.group else type(self)(group, self.tables)
+        """The same policy for other targets of the same task: the plans of their motions, or all in their order."""
+        if group is self.group:
+            return self
+        known = dict(zip(self.group.kinds, self.tables, strict=True))
+        kinds = group.kinds if known.keys() >= set(group.kinds) else self.group.kinds
+        return type(self)(group, [known[kind] for kind in kinds])
 
     def start(self, located: IndexArray, present: BoolArray | None = None) -> Clocks:
         """Targets of E episodes located in the states `[E, K]`: all, or those that are `present` `[E, K]`."""
