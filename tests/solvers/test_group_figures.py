@@ -27,3 +27,15 @@ def test_two_episodes_have_no_interval() -> None:
     found = GroupEvaluation(np.arange(14.0).reshape(2, 7), False, 5.0, (5.0, 1.0))
     assert found.aihtr.low is None
     assert found.reward_per_step.low is None
+
+
+def test_a_difference_is_corrected_by_the_steps_of_the_targets() -> None:
+    rng = np.random.default_rng(0)
+    mine, theirs = np.zeros((2, 200, 7))
+    mine[:, 1] = theirs[:, 1] = rng.normal(5.0, 1.0, 200)
+    mine[:, 0] = 2 * mine[:, 1] + rng.normal(0.0, 0.01, 200)
+    one, other = (GroupEvaluation(each, False, 5.0, (5.0, 0.0)) for each in (mine, theirs))
+    found = one.less(other).aihtr
+    assert found.low is not None
+    assert found.high is not None
+    assert found.low < 10.0 < found.high < found.low + 0.02

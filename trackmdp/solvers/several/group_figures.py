@@ -90,12 +90,14 @@ class GroupEvaluation(Carded):
         return self._ratio(4, 5)
 
     def less(self, other: GroupEvaluation) -> GroupEvaluation:
-        """The differences of all totals to those of another policy for the same targets."""
+        """The differences of all totals to those of another policy for the same targets, whose steps are kept."""
         controls = None
         if self.controls and other.controls:
-            mine, theirs = self.controls, other.controls
-            controls = mine[0] - theirs[0], mine[1] - theirs[1]
+            (steps, mine), (_, theirs) = self.controls, other.controls
+            controls = steps, mine - theirs
         totals = self.totals - other.totals
+        # Policies differ most in long episodes, so that the steps explain a part of any difference.
+        totals[:, 1] = self.totals[:, 1]
         return GroupEvaluation(totals, self.exact, self.expected_length, controls)
 
     @property
