@@ -17,11 +17,11 @@ from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found, credit_of
 
 _STEPS, _HOT, _WARM, _COLD = 40, 0.2, 0.03, 0.01
-"""Temperatures; the first one, where the optimistic credit leads as well; and the last, in rewards."""
+"""Temperatures; the first one, where the optimistic credit leads as well; and the last, in rewards (without, in D)."""
 _SPREAD = 3.0
 """Standard deviation of advantage / T at first: of almost any sets."""
 _OFF, _LED = 0.05, 0.7
-"""Standard deviation by which advantages are off at first, in rewards, and the share of the steps that are led."""
+"""Standard deviation by which advantages are off at first, in the same, and the share of the steps that are led."""
 
 
 def anneal(renewal: Renewal, rng: np.random.Generator, *, led: bool = False) -> Found:
@@ -34,9 +34,10 @@ def anneal(renewal: Renewal, rng: np.random.Generator, *, led: bool = False) -> 
             kinds are needed: where a safe action misses this one ends lower, and higher where it does not.
     """
     world = renewal.world
+    unit = world.reward or world.safe_cost or 1.0
     odds, off = (
         [spread * rng.standard_normal((len(choice.rows), 1)) for choice in renewal.choices]
-        for spread in (_SPREAD, _OFF * world.reward)
+        for spread in (_SPREAD, _OFF * unit)
     )
     credit, policy = credit_of(world) if led else None, None
     for step, temperature in enumerate(np.geomspace(_WARM if led else _HOT, _COLD, _STEPS)):
@@ -47,7 +48,7 @@ def anneal(renewal: Renewal, rng: np.random.Generator, *, led: bool = False) -> 
         advantages = plans.advantages(chances, share)
         # Half of the odds before are kept: best answers of all sensors at once overshoot.
         odds = [
-            (before + (gain + share * error) / (temperature * world.reward)) / 2
+            (before + (gain + share * error) / (temperature * unit)) / 2
             for before, gain, error in zip(odds, advantages, off, strict=True)
         ]
     sets = [chance > 0.5 for chance in _chances(renewal, odds)]

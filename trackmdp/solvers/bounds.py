@@ -74,6 +74,8 @@ def valid(world: World) -> Array:
 def clocked(world: World) -> Array:
     """`[M]` the clocked bound U(x, 0): V* <= U <= `valid`.
 
+    Where sensors that miss share cells both bounds are relaxed, and U may be the looser one.
+
     On episodes that are cut, the optimum over policies that may also depend on the steps left, so a bound for all other
     policies as well.
     """
