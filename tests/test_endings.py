@@ -16,6 +16,7 @@ from tests.typed import ENVIRONMENT, refused, stub
 from trackmdp.app import launch
 from trackmdp.app.cli import main
 from trackmdp.errors import Preempted, RunError, UserError
+from trackmdp.signals import leave
 from trackmdp.solvers import optimal
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
@@ -78,6 +79,22 @@ def test_ctrl_c_behind_another_error_is_one_line(
 
     monkeypatch.setattr(launch, "launch", interrupted)
     assert main(["solve"]) == 130
+    assert capsys.readouterr() == ("", "trackmdp solve: interrupted\n")
+
+
+def test_a_signal_behind_another_error_is_one_line_and_its_status(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As where OmegaConf is stopped while it composes."""
+
+    def stopped(*_: object) -> None:
+        try:
+            leave(signal.SIGTERM, None)
+        finally:
+            {}["half made"]
+
+    monkeypatch.setattr(launch, "launch", stopped)
+    assert main(["solve"]) == 143
     assert capsys.readouterr() == ("", "trackmdp solve: interrupted\n")
 
 

@@ -93,8 +93,8 @@ def _dispatch(words: list[str]) -> int:
 def _report(command: str, error: BaseException) -> int:
     """Print why a command ended, in one line unless it is a bug; returns the exit status."""
     line, status = str(error), FAILED
-    if _interrupted(error):
-        line, status = "interrupted", INTERRUPTED
+    if signalled := _signalled(error):
+        line, status = "interrupted", signalled
     elif isinstance(error, Preempted):
         status = 128 + error.signal
     elif isinstance(error, (UserError, RunError)):
@@ -116,19 +116,21 @@ def _report(command: str, error: BaseException) -> int:
     return status
 
 
-def _interrupted(error: BaseException | None) -> bool:
-    """Whether Ctrl-C is behind an error.
+def _signalled(error: BaseException | None) -> int:
+    """The exit status of the signal that is behind an error; 0 where none is.
 
-    Python 3.11 wraps it where a class is made, as while the config is imported; and OmegaConf, interrupted while it
+    Python 3.11 wraps Ctrl-C where a class is made, as while the config is imported; and OmegaConf, interrupted while it
     composes, fails on what is half made.
     """
     passed: set[int] = set()  # an error can be behind itself: `raise a from b`, where b came of a
     while error is not None and id(error) not in passed:
         if isinstance(error, KeyboardInterrupt):
-            return True
+            return INTERRUPTED
+        if isinstance(error, SystemExit):  # of `trackmdp.signals.leave`
+            return int(error.code or 0)
         passed.add(id(error))
         error = error.__cause__ or error.__context__
-    return False
+    return 0
 
 
 def _run(command: str, words: list[str]) -> int:
