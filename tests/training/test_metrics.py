@@ -16,7 +16,8 @@ from trackmdp.config import CsvConfig, TensorboardConfig
 from trackmdp.config.compose import compose
 from trackmdp.durable import write_json, write_text
 from trackmdp.training.callbacks import Position
-from trackmdp.training.loggers import CsvLogger, TensorboardLogger
+from trackmdp.training.loggers import CsvLogger
+from trackmdp.training.result_loggers import TensorboardLogger
 
 ROW = {"iteration": 1, "frames": 256, "aihtr": 0.1 + 0.2, "loss": 1e-300, "gap": -1 / 3}
 

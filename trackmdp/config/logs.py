@@ -31,14 +31,14 @@ class CsvConfig(RowsConfig):
     """`metrics.csv`, which a training always writes: without this choice a row for every iteration."""
 
 
-@choice("log", "tensorboard", makes="trackmdp.training.loggers:TensorboardLogger")
+@choice("log", "tensorboard", makes="trackmdp.training.result_loggers:TensorboardLogger")
 class TensorboardConfig(RowsConfig):
     """TensorBoard event files."""
 
     package = "tensorboard"
 
 
-@choice("log", "wandb", makes="trackmdp.training.loggers:WandbLogger")
+@choice("log", "wandb", makes="trackmdp.training.trackers:WandbLogger")
 class WandbConfig(RowsConfig):
     """Weights & Biases. `wandb sync` uploads an offline log, in the folder of the run."""
 
@@ -49,7 +49,7 @@ class WandbConfig(RowsConfig):
     project: str = option("project of the run", expects="a name", pattern=r"[\w .-]{1,128}")
 
 
-@choice("log", "mlflow", makes="trackmdp.training.loggers:MlflowLogger")
+@choice("log", "mlflow", makes="trackmdp.training.trackers:MlflowLogger")
 class MlflowConfig(RowsConfig):
     """MLflow, in a database or on a server."""
 
