@@ -8,8 +8,47 @@ other sensor gains anything, and each sensor that is on costs its c. Gains are g
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
+
+from trackmdp.sensing.task import Task
+
+
+@dataclass(frozen=True)
+class Credit:
+    """The discount of returns, and the safe action in units of r.
+
+    Attributes:
+        discount: γ.
+        safe_cost: D.
+        forced: r - D; or about the sum of all forced steps until one locates.
+        safe_detection: `[M + 1]` p_s of each key, 0 outside; None where it always locates.
+    """
+
+    discount: float
+    safe_cost: float
+    forced: float
+    safe_detection: Tensor | None
+
+    @classmethod
+    def of(cls, task: Task, discount: float, device: torch.device) -> Credit:
+        """Known to the learner like the prices: it is the task's.
+
+        Args:
+            task: its safe action.
+            discount: γ.
+            device: of the probabilities.
+        """
+        cost, safe = task.safe_cost / task.reward, float(task.safe_detection.mean())
+        forced = (safe - cost) / (1.0 - discount * (1.0 - safe))
+        if task.safe:
+            return cls(discount, cost, forced, None)
+        locates = torch.as_tensor(task.safe_detection, dtype=torch.float32, device=device)
+        every = locates.repeat_interleave(task.keys.num_classes)
+        return cls(discount, cost, forced, pad(every, (0, 1)))
 
 
 def sensing_gain(

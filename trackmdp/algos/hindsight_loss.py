@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from trackmdp.algos.actor_loss import ActorLoss, SensorCredit, decision_loss
-from trackmdp.algos.gains import chain_returns, clocked_advantage, gather, scatter_add, sensing_gain
+from trackmdp.algos.actor_loss import ActorLoss, SensorCredit
+from trackmdp.algos.clocked_loss import ClockedLoss
+from trackmdp.algos.gains import Credit, clocked_advantage, scatter_add
 from trackmdp.algos.in_view import SensorsInView
+from trackmdp.algos.own_plans import OwnPlans, Replayed
 from trackmdp.algos.path_replay import Replay
 from trackmdp.arrays.types import IndexArray
 from trackmdp.policies.cell_clock import CellClockNet
@@ -26,26 +27,6 @@ _FEWEST_ROWS = 20
 _LEAST_GAIN = 0.2
 _EXPLORING_AT_END = 1 / 16
 """Share of exploring starts (`Replay.begin`) at λ = 1; at λ = 0 it is a half."""
-
-
-@dataclass(frozen=True)
-class _Replayed:
-    """The policy's own plans followed on every path, as tables for the actor's loss.
-
-    Attributes:
-        row: `[T+1, B]`, the place in `[M, T+1]` of the path's first cell.
-        entry: `[T+1, B]`, the place in `[M, T+1, K]` of the sensor the target moved to.
-        alive: `[T+1, B]`, probability that the target was not yet located where it is in the grid, else 0.
-        gain: `[T+1, B]`, of a report there, times `alive`.
-        target: `[M, 1]`, mean return of the paths from each cell, the critic's target; where the safe action may miss
-            `[M, 2]`, the second of paths with it at the first step.
-    """
-
-    row: Tensor
-    entry: Tensor
-    alive: Tensor
-    gain: Tensor
-    target: Tensor
 
 
 class HindsightLoss(nn.Module):
@@ -92,17 +73,16 @@ class HindsightLoss(nn.Module):
         self.near = Window.reaching(task, reach, device)
         self.view = _in_view(task, choices * reach, device)
         self.nearby, self.sensors = SensorsInView(task, self.near), SensorsInView(task, self.view)
-        # [M, C], the cells that are near each located one.
-        cells = self.near.cells.repeat_interleave(self._classes, dim=0)
-        self._near_cells = nn.Buffer(cells, persistent=False)
         self._make_nets(hidden, classes)
         actor_loss.allocate((task.num_keys, choices, self.sensors.width), device)
         self.actor_loss = actor_loss
-        self.discount = discount
         entries = max(self.sensors.entries, self.near.width * self._keys.modes)
         self._keys_at_once = max(1, max_entries // (choices * entries))
-        self._keep_safe_action()
+        credit = Credit.of(task, discount, device)
+        self._forced = credit.forced
+        self._clocked = ClockedLoss(task, self.near, self.nearby, self.clocked_actor, credit, reach)
         self.clocks = nn.Buffer(torch.arange(choices, device=device).unsqueeze(-1))
+        self._plans = OwnPlans(task, self.view, self.clocks, credit)
         # Row 0 for the clocked actor, row 1 for the actor.
         self.gain_scale = nn.Buffer(torch.ones(2, choices, device=device))
 
@@ -135,20 +115,6 @@ class HindsightLoss(nn.Module):
         self.clocked_actor = decisions(self.near, self.nearby)
         self.clocked_critic = net(choices + 1, outputs=1)
 
-    def _keep_safe_action(self) -> None:
-        """D and the reward of the forced step, in units of r, and p_s."""
-        task = self._task
-        self.safe_cost = task.safe_cost / task.reward
-        # (r - D) / r; or about the sum of all forced steps until one locates.
-        safe = float(task.safe_detection.mean())
-        self._forced = (safe - self.safe_cost) / (1.0 - self.discount * (1.0 - safe))
-        # [M + 1], known to the learner like the prices; 0 outside, and no state: it is the task's.
-        locates = torch.as_tensor(task.safe_detection, dtype=torch.float32).to(
-            self.near.cells.device
-        )
-        every = pad(locates.repeat_interleave(self._classes), (0, 1))
-        self._safe_detection = None if task.safe else every
-
     def parts(self, cells: Tensor, on: Tensor, blend: float) -> Iterator[dict[str, Tensor]]:
         """The losses, a few located cells at a time; the critics' come with the last part.
 
@@ -172,18 +138,18 @@ class HindsightLoss(nn.Module):
         clocked, value = self._values()
         # [T + 1, M + 1], nothing gained by sensing an exited target. Detached: decisions do not train the values.
         advantage = pad(clocked_advantage(clocked.detach()), (0, 1))
-        plans = self._replay(
+        plans = self._plans.followed(
             replay, cells, own, (found, torch.cat(paid)), advantage, value.detach(), blend
         )
         weights = (
-            self._weights(0, *self._first_gains(cells[1], advantage)),
+            self._weights(0, *self._clocked.first_gains(cells[1], advantage)),
             self._weights(1, plans.alive.sum(1), plans.gain.abs().sum(1)),
         )
         # [M + 1, T + 2], U = 0 once exited.
         known, targets = pad(clocked.detach(), (0, 0, 0, 1)), []
         for rows in slices:
             chosen = self._paths_from(cells[0], rows)
-            loss, target = self._clocked(cells[:2, chosen], rows, advantage, known)
+            loss, target = self._clocked.of(cells[:2, chosen], rows, advantage, known)
             if own is not cells:
                 chosen = self._paths_from(own[0], rows)
             actor_loss = self._own(plans, rows, chosen)
@@ -217,178 +183,7 @@ class HindsightLoss(nn.Module):
             return slice(None)
         return ((start >= rows.start) & (start < rows.stop)).nonzero().squeeze(1)
 
-    def _first_gains(self, end: Tensor, advantage: Tensor) -> tuple[Tensor, Tensor]:
-        """How many paths stay in the grid for a move, and the sum of the gains of sensing there, `[T+1]`."""
-        # The gain depends on the end y and the clock alone, so moves are counted by y: [T + 1, M] @ [M].
-        arrived = torch.bincount(end, minlength=advantage.shape[1])[:-1].float()
-        gain = sensing_gain(advantage[:, :-1], discount=self.discount)
-        return arrived.sum(), gain.abs() @ arrived
-
-    def _clocked(
-        self, moves: Tensor, rows: slice, advantage: Tensor, known: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """From the moves `[2, B]` out of the cells `rows`, at every clock: the position is revealed after every action.
-
-        Returns:
-            The clocked actor's losses summed per clock, `[T+1]`, and the clocked critic's targets `[rows, T+2]`.
-        """
-        nearby, logits = self._near_cells[rows], self.clocked_actor(rows)
-        k, h = nearby.shape[1], self._keys.modes
-        ends = self._ends(nearby, rows)
-        moved, visits = self._counted(moves, rows, len(nearby))
-        stays = moved.sum(-1)
-        # advantage[:, ends] is [T + 1, x, C H]: transposed to the layout [x, T + 1, C H].
-        gain = moved * sensing_gain(advantage[:, ends].transpose(0, 1), discount=self.discount)
-        # All moves to a key have the same gain, so its sign makes it a part of its cell's G⁺ or G⁻.
-        plus, minus = (
-            part.unflatten(-1, (k, h)).sum(-1)
-            for part in (gain.clamp(min=0), gain.clamp(max=0).neg())
-        )
-        chosen, cost = logits.detach() > 0, self.nearby.prices[rows].unsqueeze(1)
-        window = self._task.numbered
-        if window is not None and window < self.reach:
-            # Sensors outside the window cannot be chosen: they neither gain nor cost, nor are they learned about.
-            allowed = self._choosable(window, rows).unsqueeze(1)
-            chosen, cost = chosen & allowed, cost * allowed
-            plus, minus = plus * allowed, minus * allowed
-        # Each sensor on adds its gain, which turns gamma U(j, n + 1) into r + gamma U(j, 0), and takes its cost away.
-        found = ((plus - minus) * self.nearby.reports(chosen, rows)).sum(-1)
-        sensed = found, stays * (chosen * cost).sum(-1)
-        target = self._clocked_returns(moved, known[ends], ends, sensed) / visits.clamp(min=1)
-        # The price is c for every move that stays in the grid.
-        plus, minus = (self.nearby.gains(each, chosen, rows) for each in (plus, minus))
-        loss = decision_loss(logits, plus, minus, stays.unsqueeze(-1) * cost)
-        return loss.sum((0, 2)), target
-
-    def _ends(self, cells: Tensor, rows: slice) -> Tensor:
-        """`[x, C H]`, the keys after moves from the keys `rows` to `cells` `[x, C]`, in H modes; M outside."""
-        keys, device = self._keys, cells.device
-        start = torch.arange(keys.num_keys, device=device)[rows, None, None]
-        modes = torch.arange(keys.modes, device=device)
-        ends: Tensor = keys.next(start, 0, cells.unsqueeze(-1), modes)
-        return ends.flatten(1).clamp_max(keys.num_keys)
-
-    def _counted(self, moves: Tensor, rows: slice, count: int) -> tuple[Tensor, Tensor]:
-        """`[x, 1, C H]`, the moves from each of `count` keys by their end, and `[x, 1]` all, exits included.
-
-        Their quotient is the empirical kernel P_xj.
-        """
-        k, h, m = self.near.width, self._keys.modes, self._keys.num_keys
-        (start, end), first = moves, rows.start
-        near = self.near.index(self._keys.cell(start), self._keys.cell(end))
-        # Flat place in [rows, C H] of a move: with C = 9, H = 1, from cell 7 to its local cell 5 is 7 * 9 + 5 = 68;
-        # where the slice begins at cell 4, 68 - 36 = 32. Exits have weight 0, wherever `index` puts them.
-        place = (start * k + near - first * k) * h + end % h
-        moved = scatter_add((end < m).float(), place, count * k * h).view(count, 1, k * h)
-        return moved, torch.bincount(start - first, minlength=count).unsqueeze(-1)
-
-    def _clocked_returns(
-        self, moved: Tensor, known: Tensor, ends: Tensor, sensed: tuple[Tensor, Tensor]
-    ) -> Tensor:
-        """`[x, T+2]`, sums over the moves from x of r, gamma U and prices; `sensed`: gains and prices, `[x, T+1]`.
-
-        U(x, n) = sum_j P_xj gamma U(j, n + 1), if nothing is sensed. At n = T + 1 all are located: r - D + gamma U(j,
-        0).
-        """
-        # [x, 1, C H] @ [x, C H, T + 2]: gamma sum_j moved_j U(j, n), for all n by one product.
-        following, stays = self.discount * torch.bmm(moved, known).squeeze(1), moved.sum(-1)
-        if self._safe_detection is None:
-            forced = following[:, :1] + (1.0 - self.safe_cost) * stays
-        else:  # a missed target goes on at n = T + 1
-            located = moved.squeeze(1) * self._safe_detection[ends]
-            after = located * (1.0 + self.discount * known[..., 0])
-            missed = (moved.squeeze(1) - located) * self.discount * known[..., -1]
-            forced = (after + missed).sum(-1, keepdim=True) - self.safe_cost * stays
-        found, spent = sensed
-        return torch.cat([following[:, 1:] + found - spent, forced], dim=1)
-
-    def _replay(
-        self,
-        replay: Replay | None,
-        cells: Tensor,
-        own: Tensor,
-        policy: tuple[Tensor, Tensor],
-        advantage: Tensor,
-        value: Tensor,
-        blend: float,
-    ) -> _Replayed:
-        """From whole paths: the policy's chain is followed from their first cell until it detects or is forced.
-
-        Args:
-            replay: of a policy that remembers detections.
-            cells: the paths.
-            own: `[T+3, B]`, the key that the policy has at first, and those of a first detection at each later step.
-            policy: of each set the probability of a report in each cell in view, and its price.
-            advantage: of detecting, the position being revealed after every action.
-            value: V.
-            blend: λ.
-        """
-        (found, prices), m = policy, self._keys.num_keys
-        # [B], [T + 2, B] and [T + 1, B]: the free choices are for the first T + 1 moves, the last one is the forced
-        # step.
-        start, moves = own[0], cells[1 : len(self.clocks) + 2]
-        end = moves[:-1]
-        row, entry, seen = self._places(start, end)
-        # [T + 1, B], the probability of a report; 0 or 1 with sensors that never miss.
-        reports, inside = gather(found, entry) * seen.float(), moves < m
-        # Set costs are computed once per (x, n) and looked up by the paths, however many there are.
-        spent = gather(prices, row)
-        located = self._located(replay, cells, own, prices, value[:, 0])
-        returns = self._returns((reports, inside, spent, located), moves[-1], value)
-        # advantage is [T + 1, M + 1]: entry (n, y) is n (M + 1) + y.
-        clocked = gather(advantage, self.clocks * (m + 1) + end)
-        # V(y) - G_{n+1}: located at y now, against the plan's return on the rest of this very path. The target's true
-        # cell is known because it was sensed, not from the simulator.
-        after = located[:-1] - returns[1:]
-        gain = sensing_gain(clocked, after, discount=self.discount, blend=blend)
-        alive = _alive(inside, reports)
-        firsts = [returns[0]]
-        if self._safe_detection is not None:
-            # No set is before it, so that it is the first step of a path.
-            steps = (reports[:0], inside[:1], spent[:0], located[:1])
-            firsts.append(self._returns(steps, moves[0], value)[0])
-        # Cells without a path get the target 0, and with no visits no weight in the critic's loss.
-        totals = torch.stack([scatter_add(first, start, m) for first in firsts], dim=1)
-        target = totals / torch.bincount(start, minlength=m).clamp(min=1).unsqueeze(-1)
-        return _Replayed(row, entry, alive, gain * alive * seen, target)
-
-    def _places(self, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """`[T+1, B]` each: row and entry as in `_Replayed`, and whether a sensor of the entry may report."""
-        located_in, there = start // self._classes, end // self._classes
-        # clocks [T + 1, 1] broadcasts over paths. With M = K = 4 and T = 1: located in 3, n = 1 is row 7, and the
-        # target moving to 2 makes entry 7 * 4 + 2 = 30.
-        row = start * len(self.clocks) + self.clocks
-        # Where the target has left the grid or the view, `entry` is some other sensor's.
-        local, width = self.view.find(located_in, there), self.view.width
-        return row, row * width + local.clamp_max(width - 1), local < width
-
-    def _located(
-        self, replay: Replay | None, cells: Tensor, own: Tensor, prices: Tensor, value: Tensor
-    ) -> Tensor:
-        """`[T+2, B]`, the value of a detection at each step."""
-        if replay is None:
-            return gather(pad(value, (0, 1)), own[1:])
-        terms = {"safe_cost": self.safe_cost, "discount": self.discount}
-        return replay.worth(cells, own, prices, value, **terms)
-
-    def _returns(self, steps: tuple[Tensor, ...], end: Tensor, value: Tensor) -> Tensor:
-        """The returns of chains (`chain_returns`) that end with the safe action, the target then in `end` `[B]`."""
-        repeated = None
-        if self._safe_detection is not None:
-            # p_s of these cells, and L, the value there if the safe action misses.
-            repeated = self._safe_detection[end], pad(value[:, 1], (0, 1))[end]
-        return chain_returns(
-            *steps, safe_cost=self.safe_cost, discount=self.discount, repeated=repeated
-        )
-
-    def _choosable(self, radius: int, rows: slice) -> Tensor:
-        """`[rows, K]` bool, which of the sensors near the cells `rows` a window of that `radius` lets choose."""
-        nearby = self._near_cells[rows]
-        start = torch.arange(self._keys.num_keys, device=nearby.device)[rows] // self._classes
-        window = Window(self._task, radius, nearby.device)
-        return window.contains(start[:, None].expand_as(nearby), nearby)
-
-    def _own(self, replayed: _Replayed, rows: slice, chosen: slice | Tensor) -> Tensor:
+    def _own(self, replayed: Replayed, rows: slice, chosen: slice | Tensor) -> Tensor:
         """`[T+1]`, the actor's losses per clock, on the `chosen` paths, those from the cells `rows`."""
         logits = self.actor(rows)
         count, choices, _ = logits.shape
@@ -421,16 +216,6 @@ def _in_view(task: Task, radius: int, device: torch.device) -> Window:
     if task.numbered is None:
         return Window.reaching(task, radius, device)
     return Window(task, min(radius, task.numbered), device)
-
-
-def _alive(inside: Tensor, reports: Tensor) -> Tensor:
-    """`alive` of `_Replayed`."""
-    # Clock n is reached if no earlier set of the plan reported; other rows are not states of this policy. The move has
-    # to stay in the grid, too: an exit step earns and costs nothing.
-    alive = inside[:-1].float()
-    for n in range(1, len(alive)):
-        alive[n] *= alive[n - 1] * (1.0 - reports[n - 1])
-    return alive
 
 
 def _squared_error(values: Tensor, start: Tensor, targets: Tensor) -> Tensor:
