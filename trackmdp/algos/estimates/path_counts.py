@@ -2,24 +2,25 @@
 
 The gains of sensors along the paths (`path_gains`) are averaged over the events with one key, and compared with their
 prices. Means of seldom seen keys are drawn towards a prior mean: the mean of their class, which is the whole memory
-but the cell, times the lift of their cell (`_Shared`). Means of a seldom seen class are drawn to those of coarser ones
-(`KeySpace.contexts`).
+but the cell, times the lift of their cell (`prior_means`). Means of a seldom seen class are drawn to those of coarser
+ones (`KeySpace.contexts`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from scipy import sparse
 
-from trackmdp.algos.estimates.path_gains import AlongPaths, Paths
-from trackmdp.arrays.entries import among, block_rows, ones_at, per_row, summing
+from trackmdp.algos.estimates.key_plans import KeyPlans, along, interleaved
+from trackmdp.algos.estimates.path_gains import Paths
+from trackmdp.algos.estimates.prior_means import PriorMeans
+from trackmdp.arrays.entries import ones_at, per_row
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.grid.displacements import apart, cell_at, displacement
-from trackmdp.memory.keys import KeySpace
 from trackmdp.policies.table import PolicyTable, SetTable
 from trackmdp.sensing.decisions import sensing
 from trackmdp.sensing.task import Task
@@ -30,12 +31,6 @@ comes by the key."""
 _KEYS_AT_ONCE = 16_384
 _IN_VIEW = 0.999
 """Share of the displacements until the last free choice that are looked after; rare leaps are not."""
-_LIFTED = 30.0
-"""A cell's lift is drawn to 1 as if prior² / 30 more detections had been expected, and made; times the copies of each
-path. Where cells have few detections, and large weights serve best, the moves on a few tracks would else count for all
-keys of a cell: on storms that costs more than it gains, in a city it gains (chosen by validation tracks of both)."""
-_LITTLE = 1e-9
-"""Smallest prior weight, so that unseen keys fall back on their class even with `prior=0`."""
 
 
 @dataclass(frozen=True)
@@ -56,53 +51,6 @@ class Planned:
     def policy(self) -> PolicyTable:
         """The plans as a table of all keys."""
         return self.plans.policy()
-
-
-@dataclass(frozen=True)
-class KeyPlans:
-    """A policy that does not draw, as plans of some keys and a rule for all others.
-
-    Attributes:
-        keys: `[K]` keys with plans, in order.
-        table: their plans.
-        others: from other keys `[Q]` to their sets, `[Q * (t_max + 1), S]` bool.
-    """
-
-    keys: IndexArray
-    table: SetTable
-    others: Callable[[IndexArray], sparse.csr_array]
-
-    @classmethod
-    def of_table(cls, policy: PolicyTable, keys: IndexArray) -> KeyPlans:
-        """A policy with sets, `keys` apart."""
-        task, sets = policy.task, policy.written
-
-        def rows(keys: IndexArray) -> sparse.csr_array:
-            return sets[block_rows(keys, task.num_choices)]
-
-        return cls(keys, SetTable(task, rows(keys), len(keys)), rows)
-
-    def on(self, keys: IndexArray) -> KeyPlans:
-        """The same policy with plans of other `keys`, in their order."""
-        task, (place, known) = self.table.task, among(self.keys, keys)
-        own = self.table.sets[block_rows(place[known], task.num_choices)]
-        both = sparse.vstack([own, self.others(keys[~known])], format="csr")
-        # Rows of the known keys, then those of the others, are brought into the order of `keys`.
-        order = np.argsort(~known, kind="stable").argsort()
-        sets = both[block_rows(order, task.num_choices)]
-        return KeyPlans(keys, SetTable(task, sets, len(keys)), self.others)
-
-    def policy(self) -> PolicyTable:
-        """The sets of all keys there are."""
-        task = self.table.task
-        return PolicyTable(task, self.on(np.arange(task.num_keys)).table.sets)
-
-
-def interleaved(sets: Sequence[sparse.csr_array]) -> sparse.csr_array:
-    """The rows of a table of plans, from `[K, S]` for each n."""
-    # Plan k after n misses is row k (t_max + 1) + n.
-    order = np.arange(len(sets) * sets[0].shape[0]).reshape(len(sets), -1).T.ravel()
-    return sparse.vstack(sets, format="csr")[order]
 
 
 def plan_paths(
@@ -208,7 +156,7 @@ class _Counted:
         # have missed so far. On a path each event has one entry at most.
         contexts = [*shared, (np.arange(count), count)]
         alive = [weight[: renewal.count] for _ in contexts]
-        self._shared: list[_Shared] = []
+        self._shared: list[PriorMeans] = []
         sets: list[sparse.csr_array] = []
         above = self._above()
         for n, (step, gain) in enumerate(zip(renewal.steps, gains, strict=False)):
@@ -223,7 +171,7 @@ class _Counted:
                     mean = (own.toarray() + more * mean[above[level]]) / total[:, None]
                     report = self._reports(n, context, mean)
                 else:
-                    self._shared.append(_Shared.of(view, mean, own, arrived, prior))
+                    self._shared.append(PriorMeans.of(view.paths, mean, own, arrived, prior))
                     sets.append(self._sets_of_seen(own, arrived))
                     report = view.reports(n, sets[-1])
                 alive[level] = np.zeros(renewal.count)
@@ -286,7 +234,7 @@ class _Counted:
         """The sets after keys that were not seen."""
         return interleaved([self._expected(shared, keys) for shared in self._shared])
 
-    def _expected(self, shared: _Shared, keys: IndexArray) -> sparse.csr_array:
+    def _expected(self, shared: PriorMeans, keys: IndexArray) -> sparse.csr_array:
         """`[Q, S]`, the sets after `keys` by their prior means alone."""
         view, task = self._view, self._view.paths.task
         classes = task.keys.num_classes
@@ -305,74 +253,3 @@ class _Counted:
             columns.append(on.col)
         shape = (len(keys), task.total_sensors)
         return ones_at(np.concatenate(rows), np.concatenate(columns), shape)
-
-
-@dataclass(frozen=True)
-class _Shared:
-    """Prior mean gain of a key: the mean of its class times the lift of its cell.
-
-    Were the cell and the class of a displacement independent given where the target goes, its chance would be that
-    after the class, times the lift of the cell: chance from this cell over chance from anywhere; and divided by the sum
-    of all such. Gains stand for chances here.
-
-    Attributes:
-        keys: how they are numbered.
-        common: `[C, W]` (or `[1, W]`, where the cell alone is remembered) mean gains after each class.
-        row: `[M]` of each cell in `lift`.
-        lift: `[R, W]`, the last row for cells never seen, all 1.
-        scale: `[R, C]`, so that the gains of all displacements together are lifted as those from the cell are.
-    """
-
-    keys: KeySpace
-    common: Array
-    row: IndexArray
-    lift: Array
-    scale: Array
-
-    @classmethod
-    def of(
-        cls, view: _View, common: Array, own: sparse.csr_array, arrived: Array, prior: float
-    ) -> _Shared:
-        """By counts of the keys seen: gains `[K, W]` and arrivals."""
-        task, seen = view.paths.task, view.paths.keys
-        keys, row = task.keys, np.zeros(task.num_cells, dtype=np.int64)
-        if keys.num_classes == 1:  # a key is its cell, and has the same counts
-            return cls(keys, common, row, np.ones((1, view.width)), np.ones((1, 1)))
-        cells, of_key = np.unique(keys.cell(seen), return_inverse=True)
-        together = summing(of_key, len(cells))
-        gains, weight = np.maximum((together @ own).toarray(), 0.0), together @ arrived
-        # Poisson counts with a gamma prior on the lift (DuMouchel 1999): a rare displacement that was seen once is no
-        # lift of a hundred, as it would be were chances smoothed before they are divided.
-        prior = max(prior**2 / (_LIFTED * view.paths.copies), _LITTLE)
-        chance = weight[:, None] * (gains.sum(0) / max(weight.sum(), 1e-12))
-        lift = (gains + prior) / (chance + prior)
-        common = np.maximum(common, 0.0)
-        total = ((gains.sum(1) + prior) / (chance.sum(1) + prior))[:, None] * common.sum(1)
-        product = lift @ common.T
-        scale = np.divide(total, product, out=np.zeros_like(product), where=product > 0)
-        row[:] = len(cells)
-        row[cells] = np.arange(len(cells))
-        lift, scale = (
-            np.append(each, np.ones((1, each.shape[1])), axis=0) for each in (lift, scale)
-        )
-        return cls(keys, common, row, lift, scale)
-
-    @property
-    def most(self) -> Array:
-        """`[C, W]`, no less than is expected from any cell."""
-        return self.common * self.lift.max(0) * self.scale.max(0)[:, None]
-
-    def after(self, keys: IndexArray, local: IndexArray) -> Array:
-        """`[B, W]` gains of displacements `local` `[W]` after `keys` `[B]`."""
-        # Each row of the lift once with each class: most cells are never seen, and all those have the last one.
-        classes = self.keys.num_classes
-        pairs = self.row[self.keys.cell(keys)] * classes + keys % classes
-        pairs, place = np.unique(pairs, return_inverse=True)
-        row, known = np.divmod(pairs, classes)
-        gains = self.common[known[:, None], local] * self.lift[row[:, None], local]
-        return (gains * self.scale[row, known][:, None])[place]
-
-
-def along(paths: Paths, plans: KeyPlans) -> AlongPaths:
-    """Plans followed on paths."""
-    return paths.follow(plans.on(paths.keys).table)

@@ -13,7 +13,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from trackmdp.algos.estimates.path_counts import KeyPlans, Planned, along, plan_paths
+from trackmdp.algos.estimates.key_plans import KeyPlans, along
+from trackmdp.algos.estimates.path_counts import Planned, plan_paths
 from trackmdp.algos.estimates.path_gains import AlongPaths, Paths, thinned
 from trackmdp.algos.ways import Ways
 from trackmdp.arrays.entries import ones_at, per_row, row_index
