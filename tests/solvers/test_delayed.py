@@ -14,7 +14,7 @@ from trackmdp.solvers import optimal
 from trackmdp.solvers.certify import delayed
 from trackmdp.solvers.certify.choices import LeftOut
 from trackmdp.solvers.certify.delayed import Delayed
-from trackmdp.solvers.linear import forced_worth
+from trackmdp.solvers.motion_totals import forced_worth
 from trackmdp.world.model import World
 
 

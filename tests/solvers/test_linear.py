@@ -14,10 +14,11 @@ import trackmdp as tm
 from tests.helpers import random_kernel
 from trackmdp.errors import UserError
 from trackmdp.motion.kernels import random_walk
-from trackmdp.solvers import linear, renewal, rules, value
+from trackmdp.solvers import linear, multigrid, renewal, rules, value
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.linear import RenewalSystem, accumulate, expected_steps, solve_onward
+from trackmdp.solvers.linear import RenewalSystem, accumulate, solve_onward
+from trackmdp.solvers.motion_totals import expected_steps
 from trackmdp.solvers.optimal import solve
 from trackmdp.world.model import World
 
@@ -141,7 +142,7 @@ def test_a_level_below_a_level_gives_the_same_solution(
     monkeypatch: pytest.MonkeyPatch, layers: int
 ) -> None:
     monkeypatch.setattr(
-        linear, "_COARSEST", 4 * layers
+        multigrid, "COARSEST", 4 * layers
     )  # 30 x 21 cells, 8 x 6 blocks, 2 x 2 blocks of those
     world = tm.make_world("random_support", size=[30, 21], support_size=5)
     # with two states a cell, half of all that moves changes its state
@@ -150,13 +151,13 @@ def test_a_level_below_a_level_gives_the_same_solution(
         if layers == 1
         else sparse.kron(np.full((2, 2), 0.5), world.kernel, format="csr")
     )
-    sizes, made = list[int](), linear._Level.__init__
+    sizes, made = list[int](), multigrid.Level.__init__
 
     def counted(self: Any, system: sparse.csr_array, size: Any) -> None:
         sizes.append(system.shape[0])
         made(self, system, size)
 
-    monkeypatch.setattr(linear._Level, "__init__", counted)
+    monkeypatch.setattr(multigrid.Level, "__init__", counted)
     system = RenewalSystem(sparse.csr_array(kernel), (30, 21), direct=0)
     gathered = np.random.default_rng(0).random(630 * layers)
     expected = np.linalg.solve(np.eye(630 * layers) - kernel.toarray(), gathered)

@@ -13,7 +13,7 @@ from trackmdp.solvers.certify import listing
 from trackmdp.solvers.certify.listing import best_plans
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.exchange import revealed
-from trackmdp.solvers.linear import forced_worth
+from trackmdp.solvers.motion_totals import forced_worth
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.world.model import World
 

@@ -17,7 +17,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, linear, rules
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
-from trackmdp.solvers.linear import expected_steps
+from trackmdp.solvers.motion_totals import expected_steps
 from trackmdp.solvers.value import key_visits
 from trackmdp.world.model import World
 

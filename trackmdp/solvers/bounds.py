@@ -18,13 +18,8 @@ from trackmdp.arrays.types import AnyArray, Array, BoolArray
 from trackmdp.sensing.choose import Own
 from trackmdp.sensing.cover import Shared
 from trackmdp.sensing.decisions import Decisions, sensing
-from trackmdp.solvers.linear import (
-    RenewalSystem,
-    accumulate,
-    expected_steps,
-    grid_of,
-    still_to_come,
-)
+from trackmdp.solvers.linear import RenewalSystem, accumulate
+from trackmdp.solvers.motion_totals import expected_steps, grid_of, still_to_come
 from trackmdp.world.model import World
 
 

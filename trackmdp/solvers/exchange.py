@@ -27,7 +27,7 @@ from trackmdp.config.sensors import LARGEST_PRICE
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers.bounds import one_set
-from trackmdp.solvers.linear import forced_worth
+from trackmdp.solvers.motion_totals import forced_worth
 from trackmdp.solvers.plans import Layout, Plans, Turn
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import (

@@ -9,18 +9,18 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
 from scipy.linalg.blas import daxpy
-from scipy.linalg.lapack import dgetrf, dgetrs
-from scipy.sparse.linalg import splu, spsolve_triangular
+from scipy.sparse.linalg import spsolve_triangular
 
-from trackmdp.arrays.entries import short_indices, summing
+from trackmdp.arrays.entries import short_indices
 from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.errors import UserError
-from trackmdp.world.model import World
+from trackmdp.solvers.factors import ENDLESS, FULL, factorised
+from trackmdp.solvers.multigrid import Level
 
 DIRECT_CELLS = 20_000
 """Cells up to which systems are factorised. The factors of a grid fill about M^1.4 entries: 75 a cell at M = 16,384."""
@@ -29,36 +29,22 @@ KEYED_DIRECT = 700
 """Events of several keys or modes a cell up to which their system is factorised, as a full matrix: each leads to all
 cells in reach."""
 
-# Cells up to which a full matrix is factorised, in a quarter of the time: beliefs that spread leave few zeros.
-FULL = 200
-# Side of the square blocks that are one cell of the next coarser level, and cells at which a level is factorised.
-_BLOCK = 4
-_COARSEST = 4_096
 # Residual aimed at, relative to the size of right-hand side and solution: some 50 units of rounding of float64.
 TOLERANCE = 1e-14
 _MOST_PRODUCTS = 20_000
-# Changes that count as rounding, relative to the largest number.
-_LAST_BITS = 4.0 * float(np.finfo(np.float64).eps)
-# Where some cells have no way out, I - P is singular; if rounding lets the solve pass, lengths come out negative or
-# about 1 / 1e-16. No kernel that is meant to end comes near 1e12 steps.
-_LONGEST_EPISODE = 1e12
-_ENDLESS = (
-    "kernel: from some cell the target never exits, so no value is finite: "
-    "expected an exit reachable from each cell"
-)
 
 
 class RenewalSystem:
     """Solves ``v = gathered + transition v`` for any number of `gathered`.
 
     Up to `direct` cells by a sparse LU factorisation, above by BiCGSTAB preconditioned on coarser and coarser grids
-    (`_Level`), without which the number of products grows with the length of the episodes: at N = 256 and p_exit = 5e-5
+    (`Level`), without which the number of products grows with the length of the episodes: at N = 256 and p_exit = 5e-5
     to 3,434. So it is some 65 at any N, and some 95 at N = 512 where only the border lets the target out.
 
     Args:
         transition: `[M, M]` sub-stochastic; or `[KM, KM]` of K states per cell, cell j in its k-th state being kM + j.
         size: (rows, columns) of the grid, or `[B]` a group of each of B states that are no cells, at most
-            `_COARSEST` groups: they take the place of a coarser grid.
+            `COARSEST` groups: they take the place of a coarser grid.
         direct: cells of a grid up to which a factorisation is used; of other states it is `KEYED_DIRECT`.
         tolerance: residual at which an iteration ends, relative to the size of right-hand side and solution.
 
@@ -88,7 +74,7 @@ class RenewalSystem:
             return
         diagonal = self._system.diagonal()
         self._precondition: Callable[[Array], Array] = (
-            (lambda right: right / diagonal) if size is None else _Level(self._system, size)
+            (lambda right: right / diagonal) if size is None else Level(self._system, size)
         )
 
     def solve(
@@ -121,12 +107,12 @@ class RenewalSystem:
             )
         # A singular system may be factorised all the same, and then gives inf or nan in place of an error.
         if not np.isfinite(total).all():
-            raise UserError(_ENDLESS)
+            raise UserError(ENDLESS)
         return total
 
     @cached_property
     def _solve(self) -> Callable[[Array, bool], Array]:
-        return _factorised(self._system, self._full if self.exact else self._system.shape[0])
+        return factorised(self._system, self._full if self.exact else self._system.shape[0])
 
     def changed(self, other: RenewalSystem, states: IndexArray) -> Array:
         """`[m, m]` (T' - T)(I - T)^-1 between those `states` `[m]` in which the T' of another system differs from T.
@@ -145,7 +131,7 @@ class RenewalSystem:
         other = copy.copy(self)
         other._system = sparse.csr_array(self._system.T)
         if self._size is not None:
-            other._precondition = _Level(other._system, self._size)
+            other._precondition = Level(other._system, self._size)
         return other
 
     def residual(self, gathered: Array, solution: Array) -> Array:
@@ -216,128 +202,11 @@ class RenewalSystem:
         return solution, products
 
 
-class _Level:
-    """Approximate inverse of a system on a grid: here the differences of neighbours, one level down the smooth part.
-
-    Two damped Jacobi sweeps reduce the differences between neighbours; between them comes a correction, constant on
-    blocks of 4 x 4 cells: the next level's approximate solution. That level costs a sixteenth, so it is applied twice;
-    the number of products hardly grows with the grid and equals the number with the exact solution of that level.
-
-    Args:
-        system: `[KM, KM]`, K states a cell; cell j in its k-th state is kM + j.
-        size: (rows, columns) of the grid; or the group of each state.
-    """
-
-    def __init__(self, system: sparse.csr_array, size: tuple[int, int] | IndexArray) -> None:
-        self._system = system
-        # 0.8 is the usual damping of Jacobi as a smoother.
-        self._damping = 0.8 / system.diagonal()
-        if isinstance(size, tuple):
-            # States beyond one per cell are that many layers of the grid, each with blocks of its own.
-            layers = system.shape[0] // (size[0] * size[1])
-            self._blocks = sparse.csr_array(sparse.block_diag([_blocks(*size)] * layers))
-        else:
-            self._blocks = summing(size, size.max() + 1).T.tocsr()
-        self._sums = self._blocks.T
-        # Galerkin: with B [M, blocks] the indicator of the blocks, B^T A B is the system seen by vectors that are
-        # constant on each block.
-        coarse = short_indices(sparse.csr_array(self._sums @ system @ self._blocks))
-        if coarse.shape[0] <= _COARSEST or not isinstance(size, tuple):
-            solve = _factorised(coarse)
-            self._corrected: Callable[[Array], Array] = lambda left: solve(left, False)
-            return
-        below = _Level(coarse, (-(-size[0] // _BLOCK), -(-size[1] // _BLOCK)))
-
-        def twice(left: Array) -> Array:
-            guess = below(left)
-            return guess + below(left - coarse @ guess)
-
-        self._corrected = twice
-
-    def __call__(self, residual: Array) -> Array:
-        """`[KM]`, about the solution of system x = `residual`."""
-        guess: Array = self._damping * residual
-        left = residual - self._system @ guess
-        guess += self._blocks @ self._corrected(self._sums @ left)
-        left = residual - self._system @ guess
-        left *= self._damping
-        guess += left
-        return guess
-
-
 def accumulate(
     transition: sparse.csr_array, gathered: Array, size: tuple[int, int] | None = None
 ) -> Array:
     """Solve ``v = gathered + transition v`` once; see `RenewalSystem`."""
     return RenewalSystem(transition, size).solve(gathered)
-
-
-def forced_worth(world: World, detected: Array) -> Array:
-    """`[Z]` worth of the target in each state when the safe action is next, repeated until it locates the target.
-
-    L = P [p_s (r + V) + (1 - p_s) L] - D p_in, `detected` `[Z]` being r + V: another linear system, of matrix
-    P (1 - p_s), which without misses is empty.
-    """
-    if world.safe:
-        return world.kernel @ (detected - world.safe_cost)
-    found = world.safe_detection[world.motion.cell]
-    located = world.kernel @ (found * detected) - world.safe_cost * world.stay_probability
-    return _safe_system(world).solve(located)
-
-
-@lru_cache(maxsize=1)
-def _safe_system(world: World) -> RenewalSystem:
-    """The moves on which the safe action misses the target."""
-    missed = world.kernel.multiply(1.0 - world.safe_detection[world.motion.cell])
-    return RenewalSystem(sparse.csr_array(missed), grid_of(world))
-
-
-def grid_of(world: World) -> tuple[int, int] | None:
-    """(rows, columns) where the states of a world are its cells; else None."""
-    return world.size if world.modes == 1 else None
-
-
-@lru_cache(maxsize=1)
-def expected_steps(world: World) -> Array:
-    """`[Z]` expected steps until the exit, the exit step included; sensing never changes it.
-
-    Raises:
-        UserError: from some cell the target never exits.
-    """
-    # L = 1 + P L: every step counts once under every policy, so P takes the place of T.
-    steps = accumulate(world.kernel, np.ones(world.num_states), grid_of(world))
-    check_length(steps)
-    return steps
-
-
-def still_to_come(world: World, change: float, largest: float, left: int) -> float | None:
-    """The most that `left` further rounds add to a recursion over the steps left; None while they matter.
-
-    A round adds no more than the largest of the last changes, `change`, times the probability that the target is still
-    in the grid. It counts as rounding, which need not settle to the last bit, below a few units in the last place of
-    the `largest` number.
-    """
-    if change == 0.0:
-        return 0.0
-    if change > _LAST_BITS * largest:
-        return None
-    try:
-        return change * min(float(left), float(expected_steps(world).max()))
-    except UserError:  # the target never exits
-        return change * left
-
-
-def summed_over(moves: sparse.csr_array, gathered: Array, steps: int) -> Array:
-    """`[B]` or `[B, K]`, the sum of (moves)^t gathered over t = 0 ... steps - 1: the total of so many steps.
-
-    Rounds that add no more than rounding are left out; see `still_to_come`.
-    """
-    found = np.zeros_like(gathered)
-    for _ in range(steps):
-        before, found = found, gathered + moves @ found
-        if np.abs(found - before).max() <= _LAST_BITS * np.abs(found).max():
-            break
-    return found
 
 
 def solve_onward(
@@ -358,50 +227,6 @@ def solve_onward(
         system.T if transposed else system, gathered[order], lower=transposed, unit_diagonal=True
     )
     return found
-
-
-def check_length(steps: Array) -> None:
-    """Refuse expected steps that no kernel with an exit from each cell can have."""
-    if (steps < 0).any() or (steps > _LONGEST_EPISODE).any():
-        raise UserError(_ENDLESS)
-
-
-def _factorised(system: sparse.csr_array, full: int = FULL) -> Callable[[Array, bool], Array]:
-    """Solves with I - T, or with its transpose, by its LU factors.
-
-    Raises:
-        UserError: the matrix is exactly singular.
-    """
-    if system.shape[0] <= full:
-        # Transposed, each column is dominated by its diagonal, so that no rows are exchanged: a huge price in states
-        # that are not reached would leave its rounding in the others.
-        factors, pivots, singular = dgetrf(system.toarray().T, overwrite_a=True)
-        if singular:
-            raise UserError(_ENDLESS)
-        return lambda wanted, transposed: dgetrs(factors, pivots, wanted, trans=not transposed)[0]
-    try:
-        # Without pivoting, which a matrix with dominant diagonal does not need: that keeps the fill low.
-        factors = splu(
-            sparse.csc_array(system),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
-    except RuntimeError as error:  # SuperLU: the matrix is exactly singular
-        raise UserError(_ENDLESS) from error
-    return lambda wanted, transposed: factors.solve(wanted, "T" if transposed else "N")
-
-
-def _blocks(rows: int, columns: int) -> sparse.csr_array:
-    """`[M, blocks]` which block of the grid each cell lies in.
-
-    With blocks of 4 x 4, the cell in row 9 and column 20 of a grid of 256 columns (64 blocks a row of blocks) lies in
-    block 2 · 64 + 5 = 133.
-    """
-    # -(-a // b) is a / b rounded up: the last blocks of a row or column may be cut off by the border.
-    row, column = np.divmod(np.arange(rows * columns), columns)
-    block = row // _BLOCK * -(-columns // _BLOCK) + column // _BLOCK
-    return summing(block, block[-1] + 1).T.tocsr()
 
 
 def _ratio(part: float, whole: float) -> float:

@@ -28,7 +28,8 @@ from trackmdp.solvers.certify.known import adopted, planted
 from trackmdp.solvers.certify.listing import best_plans
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.exchange import best_of, exchanged, other_starts, revealed
-from trackmdp.solvers.linear import RenewalSystem, expected_steps, forced_worth, grid_of
+from trackmdp.solvers.linear import RenewalSystem
+from trackmdp.solvers.motion_totals import expected_steps, forced_worth, grid_of
 from trackmdp.solvers.regions import improved, proved, region_side
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.rules import clocked_policy

@@ -26,7 +26,8 @@ from trackmdp.solvers.certify.branch import Tree
 from trackmdp.solvers.certify.inner import InnerProblem
 from trackmdp.solvers.certify.known import adopted, planted
 from trackmdp.solvers.exchange import exchange, hopeful, revealed
-from trackmdp.solvers.linear import DIRECT_CELLS, forced_worth
+from trackmdp.solvers.linear import DIRECT_CELLS
+from trackmdp.solvers.motion_totals import forced_worth
 from trackmdp.solvers.partition import (
     Pairs,
     cells_of,

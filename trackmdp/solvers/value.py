@@ -26,15 +26,9 @@ from trackmdp.recordings.tracks import Recorded, Tracks
 from trackmdp.sensing.task import Task
 from trackmdp.solvers.evaluation import Evaluation, ReplayedTracks, by_start, pooled
 from trackmdp.solvers.events import Events, detected_codes
-from trackmdp.solvers.linear import (
-    DIRECT_CELLS,
-    RenewalSystem,
-    check_length,
-    expected_steps,
-    solve_onward,
-    still_to_come,
-)
+from trackmdp.solvers.linear import DIRECT_CELLS, RenewalSystem, solve_onward
 from trackmdp.solvers.mass import Passed, passed, passed_last
+from trackmdp.solvers.motion_totals import check_length, expected_steps, still_to_come
 from trackmdp.solvers.walk import Walk, all_events
 from trackmdp.world.model import World
 from trackmdp.world.problem import Problem

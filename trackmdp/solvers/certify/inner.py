@@ -12,7 +12,7 @@ import numpy as np
 
 from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.sensing.decisions import sensing
-from trackmdp.solvers.linear import forced_worth
+from trackmdp.solvers.motion_totals import forced_worth
 from trackmdp.solvers.plans import Layout, Plans
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.world.model import World

@@ -19,7 +19,7 @@ from trackmdp.arrays.entries import row_index, summing, with_data
 from trackmdp.arrays.types import Array
 from trackmdp.sensing.task import Task
 from trackmdp.solvers.bounds import clocked, clocked_table, valid
-from trackmdp.solvers.linear import expected_steps
+from trackmdp.solvers.motion_totals import expected_steps
 from trackmdp.world.group import Group
 from trackmdp.world.model import World
 

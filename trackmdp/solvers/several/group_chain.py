@@ -11,7 +11,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.arrays.types import Array, IndexArray
-from trackmdp.solvers.linear import summed_over
+from trackmdp.solvers.motion_totals import summed_over
 from trackmdp.solvers.several.merging import Beliefs, Clocks, Rule
 from trackmdp.world.group import Group
 

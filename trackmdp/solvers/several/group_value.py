@@ -15,7 +15,8 @@ from trackmdp.arrays.numbers import REAL
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.seeding import derive
-from trackmdp.solvers.linear import accumulate, grid_of, summed_over
+from trackmdp.solvers.linear import accumulate
+from trackmdp.solvers.motion_totals import grid_of, summed_over
 from trackmdp.solvers.several.group_chain import joint_chain
 from trackmdp.solvers.several.group_figures import GroupEvaluation
 from trackmdp.solvers.several.merging import Rule
