@@ -91,6 +91,15 @@ def test_the_bound_of_a_pair_holds_where_values_fall_from_round_to_round() -> No
     np.testing.assert_allclose(pair.value, table[:, :-1, 0], atol=1e-5)
 
 
+def test_a_tie_adds_up_over_long_episodes() -> None:
+    """To leave the other cell out is better by .00016 a step: a tie beside values of 6e8, but not over 1e9 steps."""
+    kernel = np.array([[0.8 - 1e-9, 0.2], [0.2, 0.8 - 1e-9]])
+    world = World(kernel, (1, 2), cost=0.2, t_max=0, safe_cost=0.4 - 8e-4)
+    value = evaluate(world, np.eye(2, dtype=bool)[:, None]).value
+    assert value.mean() > 1.0001 * evaluate(world, "all_on").aihtr
+    assert (value <= bounds.clocked(world)).all()
+
+
 def test_a_probability_equal_to_the_threshold_is_sensed_whatever_its_rounding() -> None:
     kernel = np.zeros((4, 4))
     kernel[:, 1], kernel[:, 2] = 0.15, 0.6

@@ -210,13 +210,29 @@ def _clocked(world: World, *, exact: bool) -> ClockedBound:
         if candidate[:, :-1].sum() <= table[:, :-1].sum():
             break
         choices, table = improved, candidate
-    # Iterated solves leave Û off by a little, and so do linear programs; with rho the excess of one improvement step
-    # over Û, and L the expected steps from each cell, U <= Û + rho max L (theory.md#bounds).
-    error = 0.0
-    if not (solved and world.coverage is None):
+    # Iterated solves leave Û off by a little, as do linear programs and ties; with rho the excess of one improvement
+    # step over Û, and L the expected steps from each cell, U <= Û + rho max L (theory.md#bounds).
+    if solved and world.coverage is None:
+        excess = _left_by_ties(world, table, choices)
+    else:
         excess = float((_one_step(world, table, exact=exact) - table).max())
-        error = float(expected_steps(world).max()) * max(excess, 0.0)
+    error = float(expected_steps(world).max()) * excess if excess > 0.0 else 0.0
     return ClockedBound(table, error)
+
+
+def _left_by_ties(world: World, table: Array, choices: _Choices) -> float:
+    """The most that a best set gains over the one of `choices`; `table` is their value.
+
+    Not as `_one_step` less `table`: of a large D in the last column that would be the rounding.
+    """
+    moves, price = _moves(world), _priced(world, world.stay_probability)
+    left = []
+    for n in range(world.num_choices):
+        worth = _reports_worth(world, table, n)
+        net = (moves.gained(worth[:, None])[:, 0] - price) * choices.on[:, n]
+        most = moves.upper(worth, price)
+        left.append(float((most - per_row(moves.rows, net, world.num_states)).max()))
+    return max(left)
 
 
 def _chosen(world: World, on: Array | BoolArray, report: Array | BoolArray) -> _Choices:
