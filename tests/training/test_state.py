@@ -168,6 +168,23 @@ def test_another_option_is_refused(
     assert files(half) == before
 
 
+def test_a_change_is_checked_with_the_options_of_the_run(
+    half: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By default there are 10,000 frames in a batch."""
+
+    def frames(folder: Path, number: int) -> int:
+        words = ["resume=auto", "quiet=true", f"collector.total_frames={number}"]
+        return main(["train", f"hydra.run.dir={folder}", *words])
+
+    for folder, batch in ((half, 256), (tmp_path / "new", 10_000)):
+        assert frames(folder, 99) == 2
+        assert f"frames_per_batch={batch}" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+    assert frames(half, 2560) == 0
+    assert len(rows(half)) == 10
+
+
 def test_a_change_without_effect_is_refused(half: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = files(half)
     assert typed(half, "resume=auto", "partition.workers=2") == 2

@@ -64,8 +64,10 @@ def prepare(command: str, composed: DictConfig, words: Sequence[str]) -> Prepare
         UserError: an option is not allowed, or the file it names is missing or not as expected.
     """
     schema = config.ROOTS[command]
-    cfg = config_of(composed_values(composed, schema), schema, Path.cwd())
-    resumes = getattr(cfg, "resume", None)
+    values = composed_values(composed, schema)
+    resumes = values.get("resume") is not None
+    # Those of a run that goes on are for its own options, which the defaults here are not.
+    cfg = config_of(values, schema, Path.cwd(), rules=not resumes)
     if not resumes:
         refuse_ignored(cfg, by_key(words))
     prepared = check(command, cfg, folder_of(composed, "hydra.run.dir"), words)

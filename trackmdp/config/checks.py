@@ -104,13 +104,14 @@ def check_choice(group: str, name: Any) -> None:
     raise refuse(group, name, f"one of {', '.join(GROUPS[group])}{none}")
 
 
-def validate(cfg: _T, place: str = "", root: Any = None) -> _T:
+def validate(cfg: _T, place: str = "", root: Any = None, *, rules: bool = True) -> _T:
     """The config; the first option that is missing, is out of range or breaks a rule is refused.
 
     Args:
         cfg: the config of a command, or a part of one.
         place: dotted key of a part.
         root: the config that a part belongs to.
+        rules: whether those between options are checked, beside each value by itself.
 
     Raises:
         UserError: the message has the key, the value and the range.
@@ -121,7 +122,7 @@ def validate(cfg: _T, place: str = "", root: Any = None) -> _T:
         if not item.allows(value):
             raise refuse(key, value, item.expected)
     # Rules between options may count on every single value; the rule of a node comes after those around it.
-    for key, node in nodes(cfg, place):
+    for key, node in nodes(cfg, place) if rules else ():
         node.check(key, root or cfg)
     return cfg
 

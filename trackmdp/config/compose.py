@@ -113,18 +113,21 @@ def composed_values(cfg: DictConfig, schema: type[Any]) -> dict[str, Any]:
     return dict(values)
 
 
-def config_of(values: dict[str, Any] | DictConfig, schema: type[Any], folder: Path) -> Any:
+def config_of(
+    values: dict[str, Any] | DictConfig, schema: type[Any], folder: Path, *, rules: bool = True
+) -> Any:
     """The dataclasses of the values, resolved and checked.
 
     Args:
         values: of `composed_values`, or of the files.
         schema: of the command.
         folder: of relative paths.
+        rules: whether those between options are checked.
 
     Raises:
         UserError: an unknown key (also one added with `+`), a missing value, a wrong type, or a broken rule.
     """
-    cfg = validate(build_config(resolved(values), schema))
+    cfg = validate(build_config(resolved(values), schema), rules=rules)
     absolute_paths(cfg, folder)
     return cfg
 

@@ -74,7 +74,7 @@ def continued(cfg: TrainConfig, folder: Path, words: Sequence[str]) -> TrainConf
         UserError: an override differs from the saved config and is not in `CHANGEABLE`.
     """
     if cfg.resume is None or not (folder / "config.yaml").is_file():
-        return cfg
+        return validate(cfg)
     saved, typed = to_dict(load_run_config(folder)), to_dict(cfg)
     # Choices before their options: log.mcap.episodes=3 log=[mcap] first adds the mcap.
     for key in sorted(map(key_of, words), key=lambda key: "." in key):
