@@ -118,6 +118,14 @@ class Display(Callback):
 
 
 _T = TypeVar("_T")
+FIGURES = {
+    "aihtr": "AIHTR",
+    "accuracy": "accuracy",
+    "sensors_per_step": "sensors per step",
+    "safe_per_episode": "safe actions per episode",
+    "expected_length": "steps per episode",
+}
+"""Figures of a policy as tables at the terminal have them."""
 _HELD_OUT: tuple[tuple[Any, ...], ...] = (
     ("aihtr", "AIHTR", 2),
     ("reward_per_step", "reward per step", 4),
