@@ -59,22 +59,19 @@ class Made(Sequence[Piece]):
 
 
 @contextmanager
-def crew(
-    workers: int = 1, cluster: str | None = None, key: str = "partition.cluster"
-) -> Iterator[Crew]:
+def crew(workers: int = 1, cluster: str | None = None) -> Iterator[Crew]:
     """Workers that stay from one call to the next; after an error or a signal the remaining ones are ended.
 
     Args:
         workers: processes; one: this one.
         cluster: ``local``: a Ray cluster of so many workers on this machine; ``auto`` or host:port: one to join, which
             has as many as it has cores. None: no Ray.
-        key: option that `cluster` was given by, for messages.
 
     Raises:
         UserError: Ray is not installed or there is no such cluster.
     """
     if cluster is not None:
-        yield from _ray(workers, cluster, key)
+        yield from _ray(workers, cluster)
     elif workers == 1:
         yield in_turn
     else:
@@ -172,7 +169,8 @@ def end_with_parent(end: Callable[[], object] = lambda: os._exit(1)) -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def _ray(workers: int, cluster: str, key: str) -> Iterator[Crew]:
+def _ray(workers: int, cluster: str) -> Iterator[Crew]:
+    key = "partition.cluster"
     require("ray", "ray", f"{key}={cluster}")
     import ray
 
