@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from trackmdp.config.options import Option, nodes, options
+from trackmdp.config.option_fields import Option
+from trackmdp.config.options import nodes, options
 
 
 @contextmanager

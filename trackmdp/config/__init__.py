@@ -14,18 +14,8 @@ from trackmdp.config.logs import (
     TensorboardConfig,
     WandbConfig,
 )
-from trackmdp.config.options import (
-    GROUPS,
-    ChoiceConfig,
-    Node,
-    NodeConfig,
-    Option,
-    Sizes,
-    choice,
-    option,
-    options,
-    refuse,
-)
+from trackmdp.config.option_fields import Option, option, refuse
+from trackmdp.config.options import GROUPS, ChoiceConfig, Node, NodeConfig, Sizes, choice, options
 from trackmdp.config.registry import conf_dir, load_plugins
 from trackmdp.config.roots import (
     ROOTS,

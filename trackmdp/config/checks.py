@@ -14,7 +14,8 @@ from typing import Any, TypeVar
 
 from omegaconf import MISSING
 
-from trackmdp.config.options import GROUPS, Option, is_number, leaves, nodes, options, refuse
+from trackmdp.config.option_fields import Option, is_number, refuse
+from trackmdp.config.options import GROUPS, leaves, nodes, options
 from trackmdp.errors import UserError
 
 _T = TypeVar("_T")

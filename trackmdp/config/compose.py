@@ -21,7 +21,8 @@ from trackmdp.config.checks import (
     refuse_ignored,
     validate,
 )
-from trackmdp.config.options import GROUPS, Node, Option, leaves, options
+from trackmdp.config.option_fields import Option
+from trackmdp.config.options import GROUPS, Node, leaves, options
 from trackmdp.config.registry import choice_values, read_values, resolved
 from trackmdp.config.roots import ROOTS
 from trackmdp.config.tree import build_config

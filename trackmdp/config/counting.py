@@ -5,17 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 from trackmdp.config.learning import EveryTaskConfig, renewed_table
-from trackmdp.config.options import (
-    BYTES,
+from trackmdp.config.option_fields import (
     TABLE,
-    Sizes,
-    choice,
     count_option,
     file_option,
     option,
     refuse,
     share_option,
 )
+from trackmdp.config.options import BYTES, Sizes, choice
 
 
 @choice("algo", "model_based", makes="trackmdp.algos.model_based:ModelBased")

@@ -12,17 +12,8 @@ from trackmdp.config.learning import (
     networks,
     renewed_table,
 )
-from trackmdp.config.options import (
-    BYTES,
-    TABLE,
-    Sizes,
-    choice,
-    count_option,
-    file_option,
-    nested,
-    option,
-    refuse,
-)
+from trackmdp.config.option_fields import TABLE, count_option, file_option, option, refuse
+from trackmdp.config.options import BYTES, Sizes, choice, nested
 
 
 class PerSensorConfig(EveryTaskConfig):

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from trackmdp.config.hidden_kernels import HiddenKernelConfig
-from trackmdp.config.options import choice, count_option, option
+from trackmdp.config.option_fields import count_option, option
+from trackmdp.config.options import choice
 from trackmdp.config.sensors import SensorConfig
 from trackmdp.config.world import GridConfig
 

@@ -6,18 +6,8 @@ import re
 from typing import Any
 
 from trackmdp.config.checks import unknown_option, validate
-from trackmdp.config.options import (
-    GROUPS,
-    TABLE,
-    Option,
-    choice,
-    file_option,
-    option,
-    options,
-    refuse,
-    require_able,
-    share_option,
-)
+from trackmdp.config.option_fields import TABLE, Option, file_option, option, refuse, share_option
+from trackmdp.config.options import GROUPS, choice, options, require_able
 from trackmdp.config.registry import choice_values, resolved
 from trackmdp.config.world import KernelConfig
 

@@ -5,18 +5,8 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from trackmdp.cluster import ADDRESS
-from trackmdp.config.options import (
-    BYTES,
-    ChoiceConfig,
-    NodeConfig,
-    Sizes,
-    choice,
-    count_option,
-    nested,
-    option,
-    refuse,
-    share_option,
-)
+from trackmdp.config.option_fields import count_option, option, refuse, share_option
+from trackmdp.config.options import BYTES, ChoiceConfig, NodeConfig, Sizes, choice, nested
 
 MOST_FRAMES = 10**12
 """Most frames of a run: eleven days at a million frames per second. A larger number is a slip."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from trackmdp.config.options import ChoiceConfig, choice, count_option, option
+from trackmdp.config.option_fields import count_option, option
+from trackmdp.config.options import ChoiceConfig, choice
 from trackmdp.errors import require
 
 

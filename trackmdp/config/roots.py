@@ -9,17 +9,8 @@ from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.by_blocks import PartitionConfig, SweptPartitionConfig
 from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig
 from trackmdp.config.logs import LogConfig
-from trackmdp.config.options import (
-    GROUPS,
-    NodeConfig,
-    count_option,
-    file_option,
-    listed,
-    option,
-    options,
-    refuse,
-    share_option,
-)
+from trackmdp.config.option_fields import count_option, file_option, option, refuse, share_option
+from trackmdp.config.options import GROUPS, NodeConfig, listed, options
 from trackmdp.config.sensors import CostConfig, SensorConfig
 from trackmdp.config.several import MergedTargetsConfig, TargetsConfig, WidthConfig
 from trackmdp.config.world import GridConfig, KernelConfig, TaskConfig

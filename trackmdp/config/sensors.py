@@ -5,18 +5,8 @@ from __future__ import annotations
 import re
 from typing import Any, ClassVar
 
-from trackmdp.config.options import (
-    TABLE,
-    ChoiceConfig,
-    Option,
-    choice,
-    count_option,
-    file_option,
-    listed,
-    option,
-    refuse,
-    require_able,
-)
+from trackmdp.config.option_fields import TABLE, Option, count_option, file_option, option, refuse
+from trackmdp.config.options import ChoiceConfig, choice, listed, require_able
 from trackmdp.config.world import GridConfig
 from trackmdp.errors import UserError
 

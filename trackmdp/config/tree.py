@@ -11,7 +11,8 @@ from typing import Any, TypeVar
 from omegaconf import MISSING, OmegaConf
 
 from trackmdp.config.checks import absolute_paths, check_choice, own_paths, suggestion, validate
-from trackmdp.config.options import GROUPS, Node, Option, as_float, options
+from trackmdp.config.option_fields import Option, as_float
+from trackmdp.config.options import GROUPS, Node, options
 from trackmdp.config.roots import CommandConfig, TrainConfig
 from trackmdp.errors import UserError
 from trackmdp.untrusted import parse_yaml, read_text

@@ -4,18 +4,8 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from trackmdp.config.options import (
-    ChoiceConfig,
-    NodeConfig,
-    Sizes,
-    choice,
-    count_option,
-    file_option,
-    option,
-    refuse,
-    require_able,
-    share_option,
-)
+from trackmdp.config.option_fields import count_option, file_option, option, refuse, share_option
+from trackmdp.config.options import ChoiceConfig, NodeConfig, Sizes, choice, require_able
 from trackmdp.errors import UserError
 
 BORDERS = ("renormalize", "inside", "clip", "exit")
