@@ -151,9 +151,13 @@ def test_temperatures_and_errors_are_in_rewards() -> None:
     assert other.aihtr == pytest.approx(10 * one.aihtr)
 
 
-@pytest.mark.parametrize(("price", "safe_cost"), [(0.05, 3.0), (0.0, 0.0)])
-def test_without_rewards_temperatures_are_in_safe_actions(price: float, safe_cost: float) -> None:
-    world = headings(3, 0.8, cost=price, t_max=1).but(safe_cost=safe_cost, reward=0.0)
+@pytest.mark.parametrize(
+    ("reward", "price", "safe_cost"), [(0.0, 0.05, 3.0), (0.0, 0.0, 0.0), (5e-324, 0.05, 3.0)]
+)
+def test_without_rewards_temperatures_are_in_safe_actions(
+    reward: float, price: float, safe_cost: float
+) -> None:
+    world = headings(3, 0.8, cost=price, t_max=1).but(safe_cost=safe_cost, reward=reward)
     renewal = Renewal(world, world.motion)
     none = [np.zeros((len(choice.rows), 1), dtype=bool) for choice in renewal.choices]
     found = exchanged(anneal(renewal, np.random.default_rng(0), led=True))

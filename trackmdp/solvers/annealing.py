@@ -18,6 +18,7 @@ from trackmdp.solvers.search import Found, credit_of
 
 _STEPS, _HOT, _WARM, _COLD = 40, 0.2, 0.03, 0.01
 """Temperatures; the first one, where the optimistic credit leads as well; and the last, in rewards (without, in D)."""
+_LEAST = 1e-100  # reward: gains in smaller ones would be no numbers
 _SPREAD = 3.0
 """Standard deviation of advantage / T at first: of almost any sets."""
 _OFF, _LED = 0.05, 0.7
@@ -34,7 +35,7 @@ def anneal(renewal: Renewal, rng: np.random.Generator, *, led: bool = False) -> 
             kinds are needed: where a safe action misses this one ends lower, and higher where it does not.
     """
     world = renewal.world
-    unit = world.reward or world.safe_cost or 1.0
+    unit = max(world.reward or world.safe_cost, _LEAST)
     odds, off = (
         [spread * rng.standard_normal((len(choice.rows), 1)) for choice in renewal.choices]
         for spread in (_SPREAD, _OFF * unit)
