@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,6 +58,15 @@ def test_every_claim_holds_where_beliefs_spread() -> None:
 def test_every_claim_holds_whatever_the_safe_action_costs() -> None:
     world = paper_world(4, 0.16, 1, 3).but(safe_cost=1e9)
     assert all(row.passed for row in checks(world).values())
+
+
+@pytest.mark.parametrize("changes", [{"window": 0}, {"safe_detection": 0.5}])
+def test_every_claim_holds_in_a_window_and_where_the_safe_action_misses(changes: Any) -> None:
+    rows = checks(paper_world(4, 0.05, 1, 3).but(**changes))
+    assert all(row.passed for row in rows.values())
+    (sharp,) = named(rows, "Theorem 1, sharp")
+    assert sharp.expected == ("window" not in changes)
+    assert all(row.holds for row in named(rows, "Q_MDP"))
 
 
 def _solution(world: World, chains: BoolArray) -> Solution:

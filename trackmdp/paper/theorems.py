@@ -13,9 +13,11 @@ from trackmdp.paper.corner import corner, dearer
 from trackmdp.paper.histories import HistoryQ
 from trackmdp.paper.worlds import paper_kernel, paper_world
 from trackmdp.policies.table import PolicyTable
+from trackmdp.sensing.task import window_cells
 from trackmdp.solvers import bounds, estimator, pomdp, rules
 from trackmdp.solvers import optimal as optimum
 from trackmdp.solvers.hidden import averaged
+from trackmdp.solvers.partition import reach
 from trackmdp.solvers.solution import Solution
 from trackmdp.solvers.value import value_of
 from trackmdp.world.model import World
@@ -100,17 +102,21 @@ def check_remarks(tolerance: float) -> Iterator[Check]:
     yield _printed_bound().judged(tolerance)
 
 
-def info_states(world: World, policy: PolicyTable) -> Iterator[tuple[Array, BoolArray]]:
+def info_states(world: World, policy: PolicyTable) -> Iterator[tuple[Array, BoolArray, BoolArray]]:
     """For n = 0 ... t_max: `[I, M]` each, of the I info states after n misses that can happen, one a located cell.
 
-    The probability of the target in each cell after its next move, given the misses, and the sensors that are on.
+    The probability of the target in each cell after its next move, given the misses, the sensors that are on, and those
+    that can be chosen.
     """
     kernel, sets, mass = world.kernel.toarray(), policy.dense() > 0, np.eye(world.num_cells)
+    near = np.ones_like(mass, dtype=bool)
+    if world.window is not None:
+        near = window_cells(world.size, world.window).toarray()
     for n in range(world.num_choices):
         missed = mass.sum(axis=1)
         can = missed > 0
         moved = mass @ kernel
-        yield moved[can] / missed[can, None], sets[can, n]
+        yield moved[can] / missed[can, None], sets[can, n], near[can]
         mass = moved * (1.0 - sets[:, n] * world.detection)
 
 
@@ -123,7 +129,7 @@ def _gains(world: World, next_cell: Array) -> tuple[Array, Array]:
 def _track_property(world: World, solution: Solution) -> Iterator[Check]:
     # Theorem tracking_property: Pr(X_{k+1} = b | s_k) > c/r is sensed.
     largest, states = np.full(2, NO_CASE), 0
-    for next_cell, on in info_states(world, solution.table):
+    for next_cell, on, _ in info_states(world, solution.table):
         unsensed = (next_cell > 0) & ~on
         gains = [gain[unsensed].max(initial=NO_CASE) for gain in _gains(world, next_cell)]
         largest, states = np.maximum(largest, gains), states + len(on)
@@ -147,6 +153,9 @@ def _needs(world: World) -> str:
     # A safe action that sees better than they do is worth seeking: to be missed may then pay.
     no_better = bool((world.safe_detection <= world.detection).all())
     needs = ["D >= the price of all sensors"] * (not dear) + ["p_s <= p_d"] * (not no_better)
+    # Located elsewhere, it has to reach the same sensors.
+    wide = world.window is None or world.window >= reach(world) * world.num_choices
+    needs += ["a window of R (T_max + 1)"] * (not wide)
     return f"the proof needs {' and '.join(needs)}" if needs else ""
 
 
@@ -186,9 +195,9 @@ def _as_pomdp(world: World) -> Iterator[Check]:
 
 
 def _estimator(world: World, solution: Solution) -> Iterator[Check]:
-    if not world.perfect:
+    if not (world.perfect and world.safe):
         # With all others on, a miss does not mean that the target is where the one sensor is off.
-        note = "its proof needs sensors that never miss"
+        note = "stated for sensors that never miss"
         yield Check(
             "Theorem 3, exact form", "the estimate from Q is the belief", NO_CASE, note=note
         )
@@ -244,10 +253,10 @@ def _qmdp_derivation(world: World) -> Iterator[Check]:
     # charges).
     for in_grid, threshold in ((False, "c/r"), (True, "c p_in / r")):
         worst = NO_CASE
-        for next_cell, on in info_states(world, rules.qmdp(world, in_grid=in_grid)):
+        for next_cell, on, near in info_states(world, rules.qmdp(world, in_grid=in_grid)):
             gain = _gains(world, next_cell)[in_grid]
             # Switching a sensor on gains `gain`, switching it off -gain; none may be positive.
-            switched = np.where(on, -gain, gain)[next_cell > 0]
+            switched = np.where(on, -gain, gain)[(next_cell > 0) & near]
             worst = max(worst, float(switched.max(initial=NO_CASE)))
         statement = f"threshold {threshold}: largest gain of switching one sensor over"
         yield Check("Q_MDP", statement, worst).of_cases(1)
