@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -152,6 +153,8 @@ def different(tracks: Tracks) -> tuple[Tracks, IndexArray]:
 def _groups(tracks: Tracks) -> IndexArray:
     """`[K]`, one number for all tracks that lead to the same cells, in the order in which they first come."""
     number: dict[tuple[bytes, bool], int] = {}
-    pieces = zip(np.split(tracks.cells, tracks.first[1:-1]), tracks.exits.tolist(), strict=True)
-    each = [number.setdefault((cells.tobytes(), leaves), len(number)) for cells, leaves in pieces]
+    # Slices of bytes: NumPy takes ten times as long to split an array.
+    cells, ends = tracks.cells.tobytes(), (tracks.first * tracks.cells.itemsize).tolist()
+    pieces = zip(pairwise(ends), tracks.exits.tolist(), strict=True)
+    each = [number.setdefault((cells[a:b], leaves), len(number)) for (a, b), leaves in pieces]
     return np.array(each, dtype=np.int64)
