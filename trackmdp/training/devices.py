@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
@@ -87,3 +90,27 @@ def _processor() -> str:
         (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")),
         platform.machine(),
     )
+
+
+@contextmanager
+def reused_memory() -> Iterator[None]:
+    """Inside, large arrays are allocated where freed ones were, if the C library is glibc.
+
+    Else glibc gives each array above 32 MB back to the system when it is freed, and the next one is mapped anew, page
+    by page: three fifths of the time to collect a batch on 64 x 64 cells, which is 200 MB.
+    """
+    library = ctypes.CDLL(None)
+    if not hasattr(library, "mallopt"):
+        yield
+        return
+    # M_TRIM_THRESHOLD and M_MMAP_MAX, see mallopt(3).
+    library.mallopt(-1, 2**30)
+    library.mallopt(-4, 0)
+    try:
+        yield
+    finally:
+        # Each as glibc sets it by itself after an array of 32 MB, M_MMAP_THRESHOLD as well.
+        library.mallopt(-1, 2**26)
+        library.mallopt(-3, 2**25)
+        library.mallopt(-4, 2**16)
+        library.malloc_trim(0)

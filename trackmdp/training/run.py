@@ -33,7 +33,7 @@ from trackmdp.solvers.evaluation import Evaluation, figures
 from trackmdp.solvers.solution import Solution
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Learning, Row, Training
-from trackmdp.training.devices import machine
+from trackmdp.training.devices import machine, reused_memory
 from trackmdp.training.evaluator import Evaluator, Score, fixed_policies, while_collecting
 from trackmdp.training.folders import SUMMARY, check_files, read_summary, write_summary
 from trackmdp.training.group_run import Several, beside, learned_policy
@@ -121,7 +121,7 @@ def complete(trainer: Learning) -> Run:
     Raises:
         UserError, Preempted, RunError: see `trainer.Trainer.run`.
     """
-    with torch_threads(trainer.config.threads):
+    with torch_threads(trainer.config.threads), reused_memory():
         return _complete(trainer)
 
 
