@@ -69,6 +69,13 @@ def test_every_claim_holds_in_a_window_and_where_the_safe_action_misses(changes:
     assert all(row.holds for row in named(rows, "Q_MDP"))
 
 
+def test_where_a_miss_leaves_one_cell_at_most_nothing_is_said_of_the_others() -> None:
+    rows = checks(World(0.95 * np.roll(np.eye(9), 1, axis=1), 3, cost=0.2))
+    assert all(row.passed for row in rows.values())
+    (second,) = named(rows, "Lemma 1, second")
+    assert second.verdict == "no case"
+
+
 def _solution(world: World, chains: BoolArray) -> Solution:
     table = PolicyTable.from_dense(world, chains)
     return replace(optimal.solve(world), table=table, evaluation=evaluate(world, table))
