@@ -18,19 +18,27 @@ if TYPE_CHECKING:  # a world draws by numpy and is made without loading torch
     import torch
 
 
+def whole_seed(seed: int) -> int:
+    """The seed of a user.
+
+    Raises:
+        UserError: it is no whole number.
+    """
+    try:
+        return operator.index(seed)  # int() would cut 1.5 to 1
+    except TypeError:
+        raise UserError(f"seed={seed}: expected an integer") from None
+
+
 def derive(seed: int, *names: str | int) -> int:
     """A 63-bit seed for the stream called `names`, for example ``derive(0, "world", 3)``.
 
     Raises:
         UserError: `seed` is no whole number.
     """
-    try:
-        whole = operator.index(seed)  # int() would cut 1.5 to 1
-    except TypeError:
-        raise UserError(f"seed={seed}: expected an integer") from None
     # Hashed, so that neighbouring seeds and names give unrelated streams: with seed + worker, worker 1 of run 0 and
     # worker 0 of run 1 would draw the same numbers. `>> 1` leaves 63 bits, which fit a signed 64-bit integer.
-    text = "/".join([str(whole), *map(str, names)])
+    text = "/".join([str(whole_seed(seed)), *map(str, names)])
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
 
 

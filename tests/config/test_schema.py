@@ -180,12 +180,17 @@ RULES = [
     (
         "train",
         "algo=ppo collector.envs=100",
-        "collector.frames_per_batch=4096: expected a multiple of 100",
+        "algo.frames_per_batch=4096: expected a multiple of 100",
     ),
     (
         "train",
         "algo=ppo collector.total_frames=4095",
-        "collector.total_frames=4095: expected at least",
+        "collector.total_frames=4095: expected at least algo.frames_per_batch=4096",
+    ),
+    (
+        "train",
+        "algo=ppo algo.total_frames=4095",
+        "algo.total_frames=4095: expected at least algo.frames_per_batch=4096",
     ),
     (
         "train",

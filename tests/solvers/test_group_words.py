@@ -52,6 +52,11 @@ def test_a_width_that_no_interval_has_is_refused(width: Any) -> None:
         evaluate(Group([tiny(0)] * 2), "none", width=width)
 
 
+def test_a_seed_is_checked_where_the_figures_are_exact() -> None:
+    with pytest.raises(UserError, match=r"seed=1\.5: expected an integer"):
+        evaluate(Group([tiny(0)] * 2), "none", seed=1.5)
+
+
 def test_a_width_may_be_any_real_number() -> None:
     assert evaluate(Group([tiny(0)] * 2), "none", width=np.float32(0.5)).exact
 

@@ -17,7 +17,7 @@ from hydra.core.plugins import Plugins
 from omegaconf import DictConfig, OmegaConf
 
 from trackmdp.app.sources import searched
-from trackmdp.app.words import diagnose
+from trackmdp.app.words import diagnose, refuse_deleted
 from trackmdp.config import GROUPS, ROOTS, conf_dir
 from trackmdp.config.registry import load_plugins, register_resolvers
 from trackmdp.config.sweeping import PLUGINS
@@ -108,6 +108,7 @@ class Composer(ExitStack):
         """
         try:
             cfg = self._compose(words)
+            refuse_deleted(self.command, words, self._compose)
         except Exception as error:  # of many kinds, ValueError among them; all are about the words
             raise diagnose(error, self.command, words, self._compose) from error
         _refuse_code(cfg, words)

@@ -97,6 +97,22 @@ def run_words(words: Iterable[str]) -> list[str]:
     return [word for word in words if not word.lstrip("+~").startswith(("hydra.", "hydra/"))]
 
 
+def refuse_deleted(command: str, words: Sequence[str], compose: Compose) -> None:
+    """Refuse `~option` and `~optimal`, which Hydra takes: the typed config needs every option.
+
+    Raises:
+        UserError: there is such a word.
+    """
+    deleted = [word for word in run_words(words) if word.startswith("~")]
+    overrides = [each for each in map(parsed, deleted) if each.key_or_group not in GROUPS]
+    if overrides:
+        root = ROOTS[command]
+        kept = [word for word in words if word not in deleted]
+        known = known_options(composed_values(compose(kept), root), root)
+        for override in overrides:
+            _check_value(override, known)
+
+
 def diagnose(error: Exception, command: str, words: Sequence[str], compose: Compose) -> UserError:
     """The `UserError` that names the one of the typed `words` that Hydra's `error` is about.
 

@@ -71,7 +71,11 @@ def unknown_option(key: str, known: Mapping[str, Option]) -> UserError:
     parent = f"{key.rpartition('.')[0]}."
     beside = [each for each in known if each.startswith(parent)]
     first = dict.fromkeys(each.split(".")[0] for each in known)
-    return UserError(f"{key}: unknown option{suggestion(key, known, beside or first)}")
+    # `algo.epoch` may mean an option of another algorithm than the one chosen; `log` has those of all that are chosen.
+    schemas = GROUPS.get(group, {})
+    several = any(each.split(".")[1] in schemas for each in beside)
+    others = [] if several else [f"{group}.{x}" for each in schemas.values() for x in options(each)]
+    return UserError(f"{key}: unknown option{suggestion(key, [*known, *others], beside or first)}")
 
 
 def check_option(key: str, value: Any, known: Mapping[str, Option]) -> None:

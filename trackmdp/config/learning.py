@@ -203,15 +203,20 @@ class CollectorConfig(ChoiceConfig):
 
     def check(self, key: str, root: Any) -> None:
         """A batch is a whole number of steps of all environments, and a run at least one batch."""
+        # Where the collector has the value of the algorithm, the algorithm's option is the one to change.
+        batch, frames = (
+            f"{'algo' if getattr(root.algo, name) == getattr(self, name) else key}.{name}"
+            for name in ("frames_per_batch", "total_frames")
+        )
         # A batch is `[B, time]`, B environments for equally many steps: TorchRL would round it up, and the
         # frames collected would not be those of the config.
         if self.frames_per_batch % self.stepped:
             factors = f"{key}.envs" + (f" x {key}.workers" if self.stepped > self.envs else "")
             expected = f"a multiple of {self.stepped} ({factors})"
-            raise refuse(f"{key}.frames_per_batch", self.frames_per_batch, expected)
+            raise refuse(batch, self.frames_per_batch, expected)
         if self.total_frames < self.frames_per_batch:
-            expected = f"at least {key}.frames_per_batch={self.frames_per_batch}"
-            raise refuse(f"{key}.total_frames", self.total_frames, expected)
+            expected = f"at least {batch}={self.frames_per_batch}"
+            raise refuse(frames, self.total_frames, expected)
 
     def needs(self, task: Sizes, root: Any) -> dict[str, int]:
         """Two batches: one is collected while the other is handed over."""

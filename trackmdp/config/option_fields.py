@@ -89,6 +89,8 @@ class Option:
         # `type`, not isinstance: True would pass as the integer 1.
         if self.kind in _KINDS and type(value) is not self.kind:
             return False
+        if self.path and value == "":  # else it would be the current folder
+            return False
         if self.choices:
             return value in self.choices
         if self.pattern:

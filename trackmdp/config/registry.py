@@ -156,7 +156,9 @@ def resolved(values: dict[str, Any] | DictConfig) -> dict[str, Any]:
     except OmegaConfBaseException as error:
         # Its further lines (full_key, object_type) are about OmegaConf.
         if isinstance(error, InterpolationToMissingValueError):
-            raise UserError(f"{message_of(error).rpartition(' ')[2]}: missing") from error
+            key = message_of(error).rpartition(" ")[2]
+            needed = f", expected {key}=NAME" if key in GROUPS else ""
+            raise UserError(f"{key}: missing{needed}") from error
         where = f"{error.full_key}: " if isinstance(error, UnsupportedValueType) else ""
         raise UserError(f"{where}{message_of(error)}") from error
     return dict(plain)

@@ -14,7 +14,7 @@ import numpy as np
 from trackmdp.arrays.numbers import REAL
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
-from trackmdp.seeding import derive
+from trackmdp.seeding import derive, whole_seed
 from trackmdp.solvers.linear import accumulate
 from trackmdp.solvers.motion_totals import grid_of, summed_over
 from trackmdp.solvers.several.group_chain import joint_chain
@@ -43,8 +43,9 @@ def evaluate_group(
         episodes: simulate so many, in place of `width`, and never the chain.
 
     Raises:
-        UserError: `width` is no number > 0.
+        UserError: `width` is no number > 0, or `seed` no whole number.
     """
+    seed = whole_seed(seed)  # checked also where the figures are exact and nothing is drawn
     if not isinstance(width, REAL) or not 0 < width < math.inf:
         raise UserError(f"width={width}: expected a number > 0")
     group = rule.group
