@@ -50,7 +50,7 @@ def path_of(given: object, name: str) -> Path:
     """The path that was given for `name` from Python.
 
     Raises:
-        UserError: it is none.
+        UserError: it is no path.
     """
     if not isinstance(given, (str, os.PathLike)):
         raise UserError(f"{name}: a {type(given).__name__}, expected a path")
@@ -61,7 +61,7 @@ def output_of(given: object, name: str) -> Path:
     """The path of a file that `name` is to write.
 
     Raises:
-        UserError: it is none.
+        UserError: it is no path.
         OutputError: it is a folder, or lies in no folder that can be written to.
     """
     path = path_of(given, name)

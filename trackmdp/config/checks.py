@@ -97,7 +97,7 @@ def check_choice(group: str, name: Any) -> None:
     """Refuse a name that is none of the choices of a group.
 
     Raises:
-        UserError: it is none.
+        UserError: there is no such choice.
     """
     if isinstance(name, str) and name in GROUPS[group]:
         return

@@ -61,10 +61,11 @@ class TrackEnv(EnvBase):
     those remembered included, are in the local numbers of `Window`, as seen from `last_cell`: a sensor farther away
     cannot be chosen, and one outside the grid costs and senses nothing.
 
-    Of a `Group` of K targets `last_cell` and `steps_since_detection` are `[*B, K]`, with `present` `[*B, K]` bool,
-    which are in the grid; and `action_history` `[*B, t_max+1, S]` holds the last actions, the latest first, since the
-    last safe action, which locates all targets. The episode ends when the last target has left. On recorded tracks a
-    target may enter later: it is then located, and before it `last_cell` is 0.
+    Of a `Group` K is the number of targets, and actions are `[*B, S]`. `last_cell` and `steps_since_detection` are
+    `[*B, K]`; `present` `[*B, K]` bool shows which targets are in the grid; `action_history` `[*B, t_max+1, S]` holds
+    the last actions, the latest first, since the last safe action, which locates all targets. The episode ends when
+    the last target has left. On recorded tracks a target may enter later: it is then located, and before it
+    `last_cell` is 0.
 
     Args:
         world: the task and the target's motion, recorded tracks, or a group of targets.
@@ -74,7 +75,7 @@ class TrackEnv(EnvBase):
         device: device of the tensors.
 
     Raises:
-        UserError: `world` is none, or a number in `batch_size` is; in `step`, an action has another shape, other
+        UserError: `world` is no world, or `batch_size` no shape; in `step`, an action has another shape, other
             values or more sensors on than the budget, or there was no reset before.
 
     Example:

@@ -113,7 +113,7 @@ def actor_of(task: Task, policy: PolicyLike | Playback, costs: Costs) -> Actor:
     """The actor of a policy; a function or module that does not draw is turned into its table first.
 
     Raises:
-        UserError: the policy is made for another grid, or is none.
+        UserError: the policy is made for another grid, or is no policy.
     """
     if isinstance(policy, Playback):
         return Actor(_writing(policy.task, costs, _issuing(policy)), 256)

@@ -34,8 +34,9 @@ class Episodes(Carded, Sequence[Episode]):
     """The episodes of one policy, all their steps end to end; a sequence of `Episode`.
 
     Attributes:
-        problem: where they took place.
-        policy: that acted, a `Policy` or a `Rule`; None for one that is no table (a playback, a function that draws).
+        problem: the world, or the recorded tracks, in which they took place.
+        policy: the one that acted, a `Policy` or a `Rule`; None where it is no table (a playback, a function that
+            draws).
         seeds: of each of the E episodes.
         start: `[E]`, cells in which the targets were located at the start.
         first: `[E + 1]`, where each episode's steps begin in the columns below, and S.

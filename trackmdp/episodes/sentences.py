@@ -15,7 +15,7 @@ _ARROWS = "→↗↑↖←↙↓↘"
 _STILL = 0.05
 """Mean cells a step below which a mode has no direction."""
 _NAMED = 4
-"""Of more targets than these it is said how many were located."""
+"""Targets whose outcomes are listed one by one; of more the sentence counts the located ones."""
 
 
 def where(cell: int, columns: int) -> str:

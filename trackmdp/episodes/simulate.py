@@ -78,7 +78,7 @@ def simulate(
         **of_group: of a `Group` alone: `merge`, "gains" or "union", as of `evaluate`.
 
     Raises:
-        UserError: the policy is made for another grid, or is none; `episodes` or `seed` is no such number.
+        UserError: the policy is made for another grid, or is no policy; `episodes` or `seed` is no such number.
     """
     check_problem(problem, "simulate")
     whole_number("simulate: episodes", episodes, 0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 COLOURS = ("#0072b2", "#c2185b", "#00694f", "#6a3d9a", "#8a7000", "#0a8f8f", "#7a4a2b", "#5c5c5c")
-"""After the last one they begin again: the number beside a target tells which it is."""
+"""After the last one they begin again; the number beside a target distinguishes it then."""
 
 
 def colour_of(target: int) -> str:

@@ -28,7 +28,7 @@ class Place:
         downwards: whether y points down, as in pictures: row 0 then has the smallest y, else the largest.
 
     Raises:
-        UserError: a number or the code is none.
+        UserError: a value is no number, or the code no projection.
     """
 
     corner: tuple[float, float]
@@ -164,7 +164,7 @@ def place_in(arrays: Mapping[str, npt.NDArray[Any]]) -> Place:
     """The place of `place_arrays`.
 
     Raises:
-        TypeError, ValueError: they are none.
+        TypeError, ValueError: they are not those of a place.
     """
     return Place(**{name: array.tolist() for name, array in arrays.items()})
 

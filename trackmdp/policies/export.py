@@ -34,8 +34,8 @@ def export(policy: Any, file: str | Path, *, value: Array | None = None, label: 
     `.onnx` and `.pt2` (`torch.export`) take int64 `last_cell` `[B]` and `steps_since_detection` `[B]` and give bool
     `action` `[B, S]`: the sensors to switch on, all of them once the target has been missed more than t_max times.
     Where the policy remembers more than the cell, the input `key` stands in place of `last_cell`; the metadata
-    `key_start` and `key_next` are its formulas (`KeySpace.recipe`). Where the place of the grid is known, `crs`,
-    `corner` and `cell_side` are it, and `cell_of` the formula of a cell of projected x and y (`Place.recipe`).
+    `key_start` and `key_next` are its formulas (`KeySpace.recipe`). Where the place of the grid is known, they also
+    hold `crs`, `corner`, `cell_side`, and in `cell_of` the formula of the cell of projected x and y (`Place.recipe`).
     `absent` are the numbers of sensors that do not exist.
     `.json` holds the sets as lists (`PolicyTable.as_lists`), `.geojson` cells on a map (`trackmdp.policies.geojson`).
 

@@ -121,7 +121,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
             check: ask everything twice, to find out whether it draws.
 
         Raises:
-            UserError: it draws, or it returns something else; or `task` is none.
+            UserError: it draws, or it returns something else; or `task` is no task.
         """
         return cls.from_module(task, function, check=check)
 

@@ -50,8 +50,8 @@ class Tracker:
         world: with the motion of the target, for `belief()`; None: not known.
 
     Raises:
-        UserError: the cell or position is outside the grid, the mode is missing or one too many, the file is none, or
-            the world is of another grid.
+        UserError: the cell or position is outside the grid; the mode is missing, or given where detections do not
+            reveal it; the file holds no policy; or the world is of another grid.
 
     Example:
         >>> from trackmdp import Policy, make_world
@@ -179,7 +179,7 @@ class Tracker:
 
         Raises:
             UserError: no `sensors()` before, or none of them sees this cell; the cell is outside the grid; the mode is
-                missing or one too many; the target has exited.
+                missing, or given where detections do not reveal it; the target has exited.
         """
         self._check_followed("report")
         if self._on is None:
@@ -222,7 +222,7 @@ class Tracker:
         """The tracker of a `state()`, with the same policy or another one of the same grid and memory.
 
         Raises:
-            UserError: the state is of another grid, other sensors or another memory, or is none.
+            UserError: the state is of another grid, other sensors or another memory, or is no state.
         """
         expected = {"task", *_NUMBERS, "on", "exited", "belief"}
         if not isinstance(state, Mapping) or set(state) != expected:
@@ -251,7 +251,7 @@ class Tracker:
         """The sensors that are on in a state.
 
         Raises:
-            UserError: they are none that can be.
+            UserError: a number is no sensor that can be chosen.
         """
         if not isinstance(on, list | None):
             raise UserError("state: expected a list or None as on")
@@ -328,7 +328,7 @@ def _probabilities(given: Any, states: int) -> Array:
     """`[1, states]`, the belief in a state.
 
     Raises:
-        UserError: it is none.
+        UserError: there are no such probabilities in it.
     """
     numbers = given if isinstance(given, list) else []
     if all(type(each) in (int, float) and 0 <= each <= 1.1 for each in numbers):
@@ -342,7 +342,7 @@ def _plan(policy: Plan | str | Path) -> Plan:
     """The policy, which may be in a file.
 
     Raises:
-        UserError: it is none.
+        UserError: it is no policy of one target, or the file holds none.
     """
     if not isinstance(policy, str | Path):
         if not hasattr(policy, "sensors"):

@@ -135,10 +135,10 @@ def _number(column: Any, name: str) -> Any:
 
 
 def _refuse_entry(column: Any, parsed: Any, name: str, expected: str) -> None:
-    """Refuse the first entry of a column that has none among the `parsed` ones, if there is one.
+    """Refuse the first entry of a column that could not be parsed: it is missing in `parsed`.
 
     Raises:
-        ValueError: there is; the message names the column and the entry.
+        ValueError: there is one; the message names the column and the entry.
     """
     wrong = np.flatnonzero(parsed.isna() & column.notna())
     if len(wrong):

@@ -56,8 +56,8 @@ def evaluate(
         policy: a `Policy` or its table, or the same dense, `[M, t_max + 1, M]`; a TensorDict module or a function
             that does not draw (`Policy.from_function`); a `Run`, a `Solution`, a model of Stable-Baselines3; or the
             name of a baseline.
-        false_alarm: p_f, with which a sensor that is on reports the target in a step in which it is not there; the
-            policy takes each report for the truth (`trackmdp.solvers.false_alarms`).
+        false_alarm: p_f, the probability that a sensor that is on reports a target that is not there; the policy
+            takes each report for the truth (`trackmdp.solvers.false_alarms`).
         **of_group: of a `Group` alone: `merge`, "gains" or "union" (the default on recorded tracks); `width`, half of
             the 95 % interval of the reward per step that is wanted, .005; and `seed` of the targets.
 

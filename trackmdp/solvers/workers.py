@@ -63,7 +63,7 @@ def crew(workers: int = 1, cluster: str | None = None) -> Iterator[Crew]:
     """Workers that stay from one call to the next; after an error or a signal the remaining ones are ended.
 
     Args:
-        workers: processes; one: this one.
+        workers: processes; with 1 all is done in this process.
         cluster: ``local``: a Ray cluster of so many workers on this machine; ``auto`` or host:port: one to join, which
             has as many as it has cores. None: no Ray.
 

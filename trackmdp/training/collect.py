@@ -108,7 +108,7 @@ def _in_workers(
 
 
 def not_started(cfg: WorkersConfig, error: Exception) -> RunError:
-    """What a worker that ended before it could collect is told as."""
+    """The error for a worker that ended before it could collect."""
     # TorchRL's message has the worker's whole traceback from its second line on.
     return RunError(f"collector={cfg.name}: a worker did not start ({message_of(error)})")
 

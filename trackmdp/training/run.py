@@ -56,7 +56,7 @@ class Run(Carded):
     Attributes:
         policy: the learned one.
         evaluation: its figures, exact where there is a motion model, else on the held-out tracks.
-        columns: figures of the iterations, of recorded tracks on the validation ones; see `metrics`.
+        columns: figures by iteration, on recorded tracks those of the validation tracks; see `metrics`.
         summary: the content of `summary.json`.
         folder: where its files are; None where none were written.
         solution: the optimum, or a bracket of it, where it was solved for at the end.

@@ -96,7 +96,7 @@ class Group(Carded):
 
     @property
     def targets(self) -> tuple[int, ...]:
-        """Kind of each target, as a learner is told; see `Task.targets`."""
+        """Kind of each target, as learners get it; see `Task.targets`."""
         return tuple(self.kind.tolist())
 
     @property

@@ -96,7 +96,7 @@ class World(Task):
 
     @property
     def recorded(self) -> None:
-        """Of recorded tracks they themselves."""
+        """None; of recorded tracks the tracks."""
 
     @property
     def selection(self) -> World:

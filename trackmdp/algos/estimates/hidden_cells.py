@@ -21,7 +21,7 @@ from trackmdp.sensing.task import Task
 
 _SWEEPS = 20
 _MOST_MOVES = 50
-"""Displacements up to which cells are drawn so: where targets leap far, the last move tells little."""
+"""Displacements up to which cells are drawn so: after a longer leap the last move hardly predicts the next."""
 _LEAP = 1e-6
 """Probability of any other move: guesses that no draw would hold for possible can be left one by one."""
 _WEIGHT = 3.0

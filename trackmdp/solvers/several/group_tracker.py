@@ -112,7 +112,7 @@ def _each(given: Any, call: str, count: int | None = None) -> list[Any]:
     """The items of a sequence.
 
     Raises:
-        UserError: it is none, or not one of `count` items.
+        UserError: it is no sequence, or has not `count` items.
     """
     found = list(given) if isinstance(given, Iterable) and not isinstance(given, str) else None
     if found is None or (count is not None and len(found) != count):
