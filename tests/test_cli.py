@@ -88,6 +88,7 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         ("train log.evry=3", "log.evry: unknown option, did you mean log.csv.every?"),
         ("evaluate run=", "run=: expected "),
         ("train kernel=table kernel.path=", "kernel.path=: expected a path"),
+        ("train seed=${nope}", "seed: Interpolation key 'nope' not found"),
         ("train ~algo", "algo: missing, expected algo=NAME"),
         ("train ~seed", "~seed: expected seed=value, without + or ~"),
         ("train ~optimal", "~optimal: expected optimal.enabled=value"),

@@ -30,7 +30,6 @@ from omegaconf import AnyNode, DictConfig, OmegaConf
 from omegaconf.errors import (
     InterpolationToMissingValueError,
     OmegaConfBaseException,
-    UnsupportedValueType,
 )
 
 from trackmdp.config.learning import MOST_FRAMES
@@ -159,7 +158,7 @@ def resolved(values: dict[str, Any] | DictConfig) -> dict[str, Any]:
             key = message_of(error).rpartition(" ")[2]
             needed = f", expected {key}=NAME" if key in GROUPS else ""
             raise UserError(f"{key}: missing{needed}") from error
-        where = f"{error.full_key}: " if isinstance(error, UnsupportedValueType) else ""
+        where = f"{error.full_key}: " if error.full_key else ""
         raise UserError(f"{where}{message_of(error)}") from error
     return dict(plain)
 
