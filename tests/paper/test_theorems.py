@@ -76,6 +76,13 @@ def test_where_a_miss_leaves_one_cell_at_most_nothing_is_said_of_the_others() ->
     assert second.verdict == "no case"
 
 
+def test_where_no_move_stays_in_the_corner_nothing_is_said_of_misses() -> None:
+    rows = checks(World(0.9 * np.roll(np.eye(9), 2, axis=1) * (np.arange(9) != 3), 3, cost=0.2))
+    assert all(row.passed for row in rows.values())
+    (first,) = named(rows, "Lemma 1, first")
+    assert first.verdict == "no case"
+
+
 def _solution(world: World, chains: BoolArray) -> Solution:
     table = PolicyTable.from_dense(world, chains)
     return replace(optimal.solve(world), table=table, evaluation=evaluate(world, table))

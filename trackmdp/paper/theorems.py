@@ -171,7 +171,7 @@ def _tower_lemma(world: World) -> Iterator[Check]:
     losses = [loss for each in solved for loss in histories.miss_losses(each)]
     # Of a rest of cells there is only one where a miss leaves two or more.
     left = [np.count_nonzero(now) for each in solved for (_, past), now in each.now.items() if past]
-    due = (stated, bool(max(left, default=0) > 1))
+    due = (stated * small.kernel.nnz, bool(max(left, default=0) > 1))
     worst = np.max([(NO_CASE, NO_CASE), *losses], axis=0)
     needs = _needs(small) if stated else ""
     note = needs or f"{len(losses)} misses, own prices and dearer ones, on the corner"
@@ -233,7 +233,7 @@ def _from_histories(solved: HistoryQ) -> Check:
     worst = float(max(errors, default=NO_CASE))
     note = f"on the corner, t_max {solved.world.t_max}, Q of {len(solved.q)} histories, without a belief"
     row = Check("Theorem 3, exact form", "the estimate from Q is the belief", worst, note=note)
-    return row.of_cases(1)
+    return row.of_cases(solved.world.kernel.nnz)
 
 
 def _from_the_solver(solved: HistoryQ) -> Check:
@@ -251,7 +251,7 @@ def _from_the_solver(solved: HistoryQ) -> Check:
     statement = "the estimator's differences of Q are those of a Q over histories"
     note = f"on the corner, {len(errors)} differences"
     worst = max(errors, default=NO_CASE)
-    return Check("Theorem 3, differences", statement, worst, note=note).of_cases(1)
+    return Check("Theorem 3, differences", statement, worst, note=note).of_cases(world.kernel.nnz)
 
 
 def _qmdp_derivation(world: World) -> Iterator[Check]:
