@@ -98,6 +98,7 @@ def reused_memory() -> Iterator[None]:
 
     Else glibc gives each array above 32 MB back to the system when it is freed, and the next one is mapped anew, page
     by page: three fifths of the time to collect a batch on 64 x 64 cells, which is 200 MB.
+    A whole run there takes .59 of the CPU time; the largest memory in use is up to 16 % more, by gaps between arrays.
     """
     library = ctypes.CDLL(None)
     if not hasattr(library, "mallopt"):
