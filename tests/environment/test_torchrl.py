@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
+import io
+import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -328,3 +331,39 @@ def test_a_snapshot_that_is_none_changes_nothing(name: str) -> None:
     with pytest.raises(UserError, match="snapshot: expected one of TrackEnv"):
         env.restore(rubbish(env)[name])
     assert (TensorDict(env.snapshot()) == before).all()
+
+
+class _Sent(pickle.Pickler):
+    """Collects the memory of the tensors that a new process would be given, and the generators."""
+
+    def __init__(self) -> None:
+        super().__init__(io.BytesIO())
+        self.memory: list[int] = []
+        self.generators = 0
+
+    def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, torch.Tensor) and obj.numel():
+            self.memory.append(obj.untyped_storage().data_ptr())
+        self.generators += isinstance(obj, torch.Generator)
+        return NotImplemented
+
+
+@pytest.mark.parametrize(
+    "problem",
+    [small_world(), Group([small_world()] * 2), recorded(by_hand([0, 1, 2], [3, 4]))],
+    ids=["world", "group", "tracks"],
+)
+def test_a_process_can_be_started_with_an_environment(problem: Any) -> None:
+    """As `MultiSyncCollector([env, env])` does: no two tensors share memory, no generator brings a temporary one."""
+    env = TrackEnv(problem, 4)
+    env.rollout(2, break_when_any_done=False)
+    sent = _Sent()
+    sent.dump(env)
+    assert sent.memory and len(set(sent.memory)) == len(sent.memory)
+    assert sent.generators == 0
+    other = copy.deepcopy(env)
+    begun = env.reset()  # from where the generators are
+    assert (begun == other.reset()).all()
+    action = torch.ones_like(env.full_action_spec["action"].zero())
+    begun["action"] = action
+    assert (env.step(begun.clone()) == other.step(begun)).all()

@@ -83,6 +83,18 @@ class Streams:
             # A checkpoint read for a GPU has all its tensors there; a generator takes its state from the CPU only.
             rng.set_state(state[name].cpu())
 
+    def __getstate__(self) -> dict[str, Any]:
+        # As arrays, which are copied into the pickle. Of a tensor a new process gets the memory, and pickled as they are
+        # generators make temporary ones, freed before the process is there ("bad value(s) in fds_to_keep").
+        states = {name: state.numpy() for name, state in self.state().items()}
+        return self.__dict__ | {"generators": states}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        states = {name: torch.from_numpy(each) for name, each in state["generators"].items()}
+        self.__dict__.update(state)
+        self.generators = {name: torch.Generator(self.device) for name in states}
+        self.load_state(states)
+
 
 class UniformDraws(Streams):
     """Uniform draws in [0, 1) of one generator.
