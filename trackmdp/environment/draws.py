@@ -84,7 +84,7 @@ class Streams:
             rng.set_state(state[name].cpu())
 
     def __getstate__(self) -> dict[str, Any]:
-        # As arrays, which are copied into the pickle. Of a tensor a new process gets the memory, and pickled as they are
+        # As arrays, copied into the pickle. Of a tensor a new process gets the memory, and pickled as they are
         # generators make temporary ones, freed before the process is there ("bad value(s) in fds_to_keep").
         states = {name: state.numpy() for name, state in self.state().items()}
         return self.__dict__ | {"generators": states}
