@@ -108,7 +108,9 @@ class Outcomes:
         # Rewards of a detection by a sensor, of a safe action that locates the target, and of one that misses it; and
         # none. As tensors: `torch.where` would make one of a number in each step.
         # Each with its own memory: Python 3.11 starts no process with two tensors that share one.
-        rewards = (torch.tensor(r, device=device) for r in (gain, gain - safe_cost, -safe_cost, 0.0))
+        rewards = (
+            torch.tensor(r, device=device) for r in (gain, gain - safe_cost, -safe_cost, 0.0)
+        )
         self._gain, self._found, self._lost, self._none = rewards
         self._zero = torch.zeros((), dtype=torch.int64, device=device)
         # After an exit, at cell M, nothing is reported.
