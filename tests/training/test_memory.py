@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import re
-import resource
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from trackmdp.app.cli import main
 from trackmdp.config import DqnConfig
 from trackmdp.errors import UserError
 from trackmdp.machine import free_bytes
-from trackmdp.training.devices import check_memory, needs, reused_memory
+from trackmdp.training.devices import check_memory, needs
 from trackmdp.world.group import Group
 
 CPU = torch.device("cpu")
@@ -191,14 +192,26 @@ def test_a_system_that_does_not_say_counts_as_unlimited(tmp_path: Path) -> None:
     assert free_bytes(tmp_path) == 2**63
 
 
+_FREED = """
+import resource
+import torch
+from trackmdp.training.devices import reused_memory
+
+def pages():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    torch.ones(2**24)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+with reused_memory():
+    print(*[pages() for _ in range(10)])
+"""
+"""Prints how many pages of memory new tensors of 64 MB are given by the system."""
+
+
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="glibc alone")
 def test_a_freed_batch_is_used_again() -> None:
-    def pages() -> int:
-        """Pages of memory that a new tensor of 64 MB is given by the system."""
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-        torch.ones(2**24)
-        return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-
-    with reused_memory():
-        # The first ones, with what is allocated beside them, make the room.
-        assert [pages() for _ in range(10)][-1] < 100
+    """In a process of its own: its heap can grow, as nothing has been mapped behind it."""
+    program = [sys.executable, "-c", _FREED]
+    printed = subprocess.run(program, check=True, stdout=subprocess.PIPE, text=True).stdout
+    # The first ones, with what is allocated beside them, make the room.
+    assert int(printed.split()[-1]) < 100

@@ -39,7 +39,7 @@ class TensorboardConfig(RowsConfig):
     package = "tensorboard"
 
 
-@choice("log", "wandb", makes="trackmdp.training.trackers:WandbLogger")
+@choice("log", "wandb", makes="trackmdp.training.experiment_trackers:WandbLogger")
 class WandbConfig(RowsConfig):
     """Weights & Biases. `wandb sync` uploads an offline log, in the folder of the run."""
 
@@ -50,7 +50,7 @@ class WandbConfig(RowsConfig):
     project: str = option("project of the run", expects="a name", pattern=r"[\w .-]{1,128}")
 
 
-@choice("log", "mlflow", makes="trackmdp.training.trackers:MlflowLogger")
+@choice("log", "mlflow", makes="trackmdp.training.experiment_trackers:MlflowLogger")
 class MlflowConfig(RowsConfig):
     """MLflow, in a database or on a server."""
 
