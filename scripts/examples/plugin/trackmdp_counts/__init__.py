@@ -1,8 +1,6 @@
 """The options of `algo=counts`: what they are, in which unit and range; their values are in `conf/algo/counts.yaml`."""
 
-from trackmdp.config.learning import AlgoConfig
-from trackmdp.config.option_fields import option
-from trackmdp.config.options import choice
+from trackmdp.config import AlgoConfig, choice, option
 
 
 @choice("algo", "counts", makes="trackmdp_counts.learner:Counts")
