@@ -103,9 +103,9 @@ class Losses:
         if not 2 <= width <= MOST_PAIRED:
             return np.zeros((count, width + 1))
         # pair[s, a, b]: joint loss of cells a and b of state s when both are left; infinite where one is padding
-        pair = np.full((count, width, width), np.inf)
+        pair, present = np.full((count, width, width), np.inf), frontier.present
         for shift in range(1, width):
-            state, place = np.nonzero(frontier.present[:, shift:])
+            state, place = np.nonzero(present[:, shift:])
             lost = self._pair(frontier, state, place, place + shift)
             pair[state, place, place + shift] = pair[state, place + shift, place] = lost
         rest = np.zeros((count, width + 1))
