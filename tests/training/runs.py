@@ -70,6 +70,22 @@ def at_iteration(patch: pytest.MonkeyPatch, iteration: int, action: Callable[[],
     patch.setattr(CsvLogger, "write", written)
 
 
+class Killed(BaseException):
+    """The process ends here: nothing is closed."""
+
+
+def killed() -> None:
+    raise Killed
+
+
+def killed_and_resumed(folder: Path, iteration: int, *overrides: str, algo: str = "ppo") -> None:
+    """A run that ends once this iteration is recorded, before its checkpoint, and goes on."""
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+        at_iteration(patch, iteration, killed)
+        train(folder, *overrides, algo=algo)
+    train(folder, *overrides, "resume=auto", algo=algo)
+
+
 def rows(folder: Path) -> list[dict[str, str]]:
     """Rows of `metrics.csv` without the columns that time decides."""
     file = folder / "metrics.csv"

@@ -10,8 +10,7 @@ from typing import Any, cast
 
 import pytest
 
-from tests.training.runs import at_iteration, rows, train
-from tests.training.test_log_resume import Killed, killed
+from tests.training.runs import killed_and_resumed, rows
 from trackmdp.app.cli import main
 from trackmdp.config import MlflowConfig, load_run_config, to_dict
 from trackmdp.errors import UserError, adding
@@ -74,14 +73,11 @@ def read(items: Any) -> dict[str, Any]:
     return {item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in items}
 
 
-def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wandb_offline(tmp_path: Path) -> None:
     """Config, every row, also those after the last frame, and the final figures; resumed, under the same id."""
     pytest.importorskip("wandb")
     words = ("log=[wandb]", "log.wandb.project=ours")
-    with monkeypatch.context() as patch, pytest.raises(Killed):
-        at_iteration(patch, 6, killed)
-        train(tmp_path, *words, algo="hindsight")
-    train(tmp_path, *words, "resume=auto", algo="hindsight")
+    killed_and_resumed(tmp_path, 6, *words, algo="hindsight")
     first, second = offline(tmp_path)
     assert first["id"] == second["id"]
     assert first["project"] == "ours"
@@ -111,7 +107,7 @@ def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.filterwarnings(
     "ignore::DeprecationWarning"
 )  # mlflow's database layer calls deprecated names
-def test_mlflow_in_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mlflow_in_the_folder(tmp_path: Path) -> None:
     """One run with the options as parameters, each row once although two processes logged it, and final figures.
 
     Iterations 9 to 12 are after the last frame.
@@ -120,10 +116,7 @@ def test_mlflow_in_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     from mlflow import MlflowClient
 
     words = ("log=[mlflow]", "checkpoint.every=512")
-    with monkeypatch.context() as patch, pytest.raises(Killed):
-        at_iteration(patch, 11, killed)
-        train(tmp_path, *words, algo="hindsight")
-    train(tmp_path, *words, "resume=auto", algo="hindsight")
+    killed_and_resumed(tmp_path, 11, *words, algo="hindsight")
     client = MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
     experiment = client.get_experiment_by_name("trackmdp")
     (run,) = client.search_runs([experiment.experiment_id])
@@ -163,25 +156,6 @@ def test_a_missing_package_is_one_line_and_leaves_no_folder(
         train_in_python(make_world(size=3), folder=tmp_path / "a", log=[name])
     assert str(caught.value) == message
     assert not (tmp_path / "a").exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (
-            "log=[wandb] log.wandb.mode=dryrun",
-            "log.wandb.mode=dryrun: expected one of offline, online",
-        ),
-        ("log=[mlflow] log.mlflow.experiment=", "log.mlflow.experiment"),
-    ],
-)
-def test_what_is_wrong_is_one_line(
-    words: str, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["train", *words.split()]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith(f"trackmdp train: {message}")
-    assert error.count("\n") == 1
 
 
 def test_a_server_that_is_not_there_is_one_line(

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.training.runs import at_iteration, train
+from tests.training.runs import Killed, at_iteration, killed, train
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.writer import EpisodeWriter
@@ -32,14 +32,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("logged") / "whole"
     train(folder, *LOGGED)
     return folder
-
-
-class Killed(BaseException):
-    """The process ends here: nothing is closed."""
-
-
-def killed() -> None:
-    raise Killed
 
 
 def cut(folder: Path, monkeypatch: pytest.MonkeyPatch, *, closes: bool, iteration: int = 6) -> None:

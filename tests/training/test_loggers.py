@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 import trackmdp as tm
-from tests.training.runs import at_iteration, rows, train
-from tests.training.test_log_resume import Killed, killed
+from tests.training.runs import killed_and_resumed, rows, train
 from trackmdp.app.cli import main
 from trackmdp.config import load_run_config, to_dict, to_yaml
 from trackmdp.config.compose import compose
@@ -35,9 +34,7 @@ def written(folder: Path) -> tuple[list[int], list[int], int]:
     return table, sorted({event.step for event in events.Scalars("iteration")}), episodes
 
 
-def test_all_three_are_written_and_each_goes_on_with_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_all_three_are_written_and_each_goes_on_with_the_run(tmp_path: Path) -> None:
     train(tmp_path / "whole", *ALL)
     table, steps, episodes = written(tmp_path / "whole")
     assert (table, steps) == ([2, 4, 6, 8], list(range(1, 9)))
@@ -47,10 +44,7 @@ def test_all_three_are_written_and_each_goes_on_with_the_run(
         "tensorboard": {"every": 1},
         "mcap": {"evaluations": 10, "episodes": 2, "layout": False},
     }
-    with monkeypatch.context() as patch, pytest.raises(Killed):
-        at_iteration(patch, 6, killed)
-        train(tmp_path / "half", *ALL)
-    train(tmp_path / "half", *ALL, "resume=auto")
+    killed_and_resumed(tmp_path / "half", 6, *ALL)
     assert written(tmp_path / "half") == (table, steps, episodes)
     assert rows(tmp_path / "half") == rows(tmp_path / "whole")
     logs = [(tmp_path / run / "episodes.mcap").read_bytes() for run in ("half", "whole")]
@@ -137,6 +131,11 @@ def test_an_option_of_a_logger_that_the_run_does_not_have(tmp_path: Path) -> Non
         ),
         ("log=[mcap] +log.csv={every:2}", "log.csv"),
         ("-m log=[csv],[nope]", "log=nope: expected one of csv, tensorboard, wandb, mlflow, mcap"),
+        (
+            "log=[wandb] log.wandb.mode=dryrun",
+            "log.wandb.mode=dryrun: expected one of offline, online",
+        ),
+        ("log=[mlflow] log.mlflow.experiment=", "log.mlflow.experiment"),
     ],
 )
 def test_what_is_wrong_is_one_line(
