@@ -23,7 +23,7 @@ def page(world: Recorded, cells: tuple[int, ...] = (1,), subject: str = "<mine>,
     policy = Policy.from_dense(world, chains)
     evaluator = HeldOutEvaluator(world)
     episodes = simulate(world, policy, 4, seed=0)
-    report = evaluator.report(policy)
+    report = evaluator.held_out(policy)
     replayed = {"policy": evaluator.replayed(policy)}
     return recorded_page(world, subject, report, replayed, {"policy": episodes}).html()
 

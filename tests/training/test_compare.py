@@ -64,7 +64,7 @@ def test_q_mdp_on_tracks_is_that_of_the_kernel_estimated_from_them() -> None:
     """As `train` and `evaluate` show it."""
     problem = recorded(drawn(WORLD.kernel, 200, 1), drawn(WORLD.kernel, 60, 2))
     evaluator = HeldOutEvaluator(problem)
-    shown = evaluator.report(tm.Policy.none(problem))["figures"][ESTIMATED]["aihtr"]["mean"]
+    shown = evaluator.held_out(tm.Policy.none(problem))["figures"][ESTIMATED]["aihtr"]["mean"]
     assert tm.compare(problem, ["qmdp", "none"]).policies[0].figures["aihtr"].mean == shown
 
 

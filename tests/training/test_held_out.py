@@ -76,7 +76,7 @@ def test_the_report_holds_the_policy_and_the_references() -> None:
     setting = recorded(drawn(world.kernel, 300), drawn(world.kernel, 80, seed=1))
     evaluator = HeldOutEvaluator(setting)
     policy = Policy.from_dense(world, np.random.default_rng(0).random((9, 2, 9)) < 0.3)
-    report = evaluator.report(policy)
+    report = evaluator.held_out(policy)
     assert (report["tracks"], report["learned_from"]) == (80, 300)
     assert set(report["figures"]) == {"policy", "all on", "no sensors", ESTIMATED}
     assert (
@@ -96,7 +96,7 @@ def test_what_remembers_more_is_compared_with_the_cell_alone() -> None:
     evaluator = HeldOutEvaluator(task)
     found = evaluator.replayed(evaluator.references[CELL_ALONE]).intervals(task.held_out.names)
     assert found["aihtr"].mean == pytest.approx(0.8 + 0.6)
-    assert list(evaluator.report(Policy.none(task))["figures"])[:2] == ["policy", CELL_ALONE]
+    assert list(evaluator.held_out(Policy.none(task))["figures"])[:2] == ["policy", CELL_ALONE]
     assert CELL_ALONE in HeldOutEvaluator(replace(task, detection=0.9)).references
     assert CELL_ALONE not in HeldOutEvaluator(replace(task, memory="cell")).references
 

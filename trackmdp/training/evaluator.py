@@ -88,7 +88,7 @@ class Evaluator:
             evaluation, regret_per_step(self.upper, evaluation), regret_per_step(best, evaluation)
         )
 
-    def report(self, policy: PolicyTable) -> dict[str, Any] | None:  # noqa: ARG002
+    def held_out(self, policy: PolicyTable) -> dict[str, Any] | None:  # noqa: ARG002
         """Figures with confidence intervals beside those of the references; None where all figures are exact."""
         return None
 
@@ -161,7 +161,7 @@ class HeldOutEvaluator(Evaluator):
             ).policy
         return found | fixed_policies(task) | {ESTIMATED: estimated_qmdp(task)}
 
-    def report(self, policy: PolicyTable) -> dict[str, Any]:
+    def held_out(self, policy: PolicyTable) -> dict[str, Any]:
         """The report on a policy: its figures on the held-out tracks beside the references'."""
         figures = {}
         for name, each in {"policy": policy, **self.references}.items():

@@ -267,7 +267,7 @@ def summarize(
         "regret_per_step": score.regret_per_step,
         "regret_per_step_lower": score.regret_per_step_lower,
         "while_collecting": while_collecting(evaluator.upper, final, end.reward, end.frames),
-        "held_out": evaluator.report(trainer.policy()),
+        "held_out": evaluator.held_out(trainer.policy()),
         "place": place.facts() if (place := trainer.problem.task.place) else None,
         "versions": {"trackmdp": __version__, "python": platform.python_version()}
         | {name: version(name) for name in _PACKAGES},

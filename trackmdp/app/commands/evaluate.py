@@ -194,7 +194,7 @@ def _held_out(
     if world.loaded:
         console.print(f"loaded: {said(world.loaded)}")
     evaluator = HeldOutEvaluator(world)
-    report = evaluator.report(policy)
+    report = evaluator.held_out(policy)
     value = evaluator.evaluate(policy).value
     content = {"policy": subject, "held_out": report} | write_sets(folder, policy, value=value)
     content |= dict.fromkeys(("regret_per_step", "regret_per_step_lower"))
