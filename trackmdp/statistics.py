@@ -72,7 +72,7 @@ def iqm(groups: Sequence[Sequence[float]]) -> float:
         for group in groups
         if len(group)
     ]
-    return float(np.mean(trimmed or [math.nan]))
+    return float(np.mean(trimmed)) if trimmed else math.nan
 
 
 def share(part: int, whole: int) -> MeanInterval:

@@ -262,7 +262,8 @@ def split(
     drawings = draw_names(own if names is None else names, held_out, validation, seed)
     judged, chosen = (np.isin(own, each) for each in drawings)
     learned = ~(judged | chosen)
-    _check_parts((judged.sum(), chosen.sum(), learned.sum()), held_out, validation)
+    counts = int(judged.sum()), int(chosen.sum()), int(learned.sum())
+    _check_parts(counts, held_out, validation)
     return tracks.select(learned), tracks.select(chosen), tracks.select(judged)
 
 
