@@ -173,6 +173,7 @@ BROKEN: dict[str, tuple[np.ndarray, str]] = {
     "inf": (_changed(6, 2, np.inf), "row 6 holds a value that is not finite"),
     "negative": (_changed(5, 8, -1e-9), "row 5 holds a negative probability"),
     "too much": (_changed(2, 2, 1.5), "row 2 sums to .*, expected at most 1"),
+    "too large to be added up": (np.full((9, 9), 1e308), "row 0 sums to inf, expected at most 1"),
     "absorbing": (paper(3, exit_probability=0.0), "from cell 0 the target never exits"),
 }
 
