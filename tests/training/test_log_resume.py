@@ -88,10 +88,11 @@ def test_a_kill_while_the_log_is_taken_over_loses_nothing(
     assert (tmp_path / "cut/episodes.mcap").read_bytes() == (whole / "episodes.mcap").read_bytes()
 
 
+@pytest.mark.parametrize("closes", [False, True])
 def test_it_begins_anew_where_nothing_is_saved_yet(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: Path
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: Path, closes: bool
 ) -> None:
-    cut(tmp_path / "cut", monkeypatch, closes=False, iteration=1)
+    cut(tmp_path / "cut", monkeypatch, closes=closes, iteration=1)
     assert (tmp_path / "cut/episodes.mcap.part").is_file()
     train(tmp_path / "cut", *LOGGED, "resume=auto")
     assert sorted(file.name for file in (tmp_path / "cut").glob("episodes*")) == ["episodes.mcap"]

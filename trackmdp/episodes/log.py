@@ -155,7 +155,7 @@ class EpisodeLogger(Callback):
 
     def __init__(self, cfg: McapConfig, folder: Path) -> None:
         self._cfg, self._folder = cfg, folder
-        self._policies, self._lost = 0, ""
+        self._policies, self._lost, self._counted = 0, "", False
 
     def on_start(self, trainer: Training) -> None:
         """Open the log; episodes after the last checkpoint of an earlier process are cut off."""
@@ -187,9 +187,17 @@ class EpisodeLogger(Callback):
             # Also where logging is over: a checkpoint must not depend on how full the disk was.
             self._policies += 1
 
+    def on_checkpoint(self, trainer: Training, file: Path) -> None:  # noqa: ARG002
+        """From now on a resumed run counts on the file."""
+        self._counted = True
+
     def on_end(self, trainer: Training) -> None:
         """Finish the file, and report lost parts of it; if the run itself failed, its own line gives the reason."""
-        self._log.close()
+        # A run that failed before its first checkpoint begins anew, and removes an unfinished log alone.
+        if trainer.error is None or self._counted or trainer.start.iteration:
+            self._log.close()
+        else:
+            self._log.abandon()
         if self._lost and trainer.error is None:
             sys.stderr.write(f"trackmdp train: {self._lost}\n")
 
