@@ -215,7 +215,24 @@ class Checkpoints(Callback):
             if later > file:
                 later.unlink()
         if trainer.position.iteration and file.is_file():
+            self._put_best_right(trainer, file.with_name(checkpoint.BEST))
             checkpoint.point(file, best=self._is_best)
+
+    def _put_best_right(self, trainer: Training, best: Path) -> None:
+        """Where best.pt is damaged, or of another course of the run, the checkpoint of the start takes its place.
+
+        Its figure is then its own: the one in its state may be of a checkpoint that was removed.
+        """
+        if self._best == -math.inf:
+            best.unlink(missing_ok=True)  # no checkpoint up to here counts
+        elif not self._is_best:
+            try:
+                if checkpoint.load(best)["iteration"] < trainer.position.iteration:
+                    return
+            except UserError:
+                pass
+            score = trainer.evaluator.score(trainer.policy())
+            self._best, self._is_best = score.evaluation.aihtr, True
 
     def on_update(self, trainer: Training, row: Row) -> None:  # noqa: ARG002
         """Save after the last iteration, and where it is due."""
