@@ -164,7 +164,9 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
             "hydra/launcher=basic,joblib: expected one launcher",
         ),
         (f"train seed={'1' * 5000}", f"seed={'1' * 5000}: expected option=value"),
-        (f"train quiet=true device=cuda:{'9' * 20}", f"device=cuda:{'9' * 20}: no such device"),
+        (f"train device=cuda:{'9' * 20}", f"device=cuda:{'9' * 20}: no such device"),
+        ("train collector.device=cuda:99", "collector.device=cuda:99: no such device"),
+        ("evaluate baseline=qmdp device=cuda:99", "device=cuda:99: no such device"),
         (
             "train hydra.sizzle=1",
             "Could not override 'hydra.sizzle': Key 'sizzle' not in 'HydraConf'",

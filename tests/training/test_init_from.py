@@ -71,7 +71,8 @@ def test_a_run_without_weights_is_named_by_its_option(
     (tmp_path / "empty").mkdir()
     for name, message in (("none", "no such folder"), ("empty", "no checkpoint in ")):
         given = f"init_from={tmp_path / name}"
-        assert typed(tmp_path / "new", given) == 2
-        error = capsys.readouterr().err
+        assert typed(tmp_path / "new", given, "quiet=false") == 2
+        out, error = capsys.readouterr()
+        assert not out
         assert error.startswith(f"trackmdp train: {given}: {message}") and error.count("\n") == 1
         assert not (tmp_path / "new").exists()

@@ -73,6 +73,7 @@ def prepare(command: str, composed: DictConfig, words: Sequence[str]) -> Prepare
     prepared = check(command, cfg, folder_of(composed, "hydra.run.dir"), words)
     if resumes:  # a run that goes on has a config of its own
         refuse_ignored(prepared.cfg, by_key(words))
+    _check_here(prepared.cfg, prepared.folder)
     return prepared
 
 
@@ -188,6 +189,24 @@ def _check_files(cfg: CommandConfig, folder: Path, words: Sequence[str]) -> None
             )
     elif isinstance(cfg, config.ReplayConfig):
         _check_outputs(cfg)
+
+
+def _check_here(cfg: CommandConfig, folder: Path) -> None:
+    """Refuse devices that this machine lacks, and weights that are not there; runs of a sweep may be elsewhere."""
+    devices = {"device": getattr(cfg, "device", "cpu")}
+    if isinstance(cfg, TrainConfig):
+        devices["collector.device"] = cfg.collector.device
+        if cfg.init_from is not None and not (folder / "config.yaml").is_file():
+            with importing():
+                from trackmdp.training.checkpoint import newest
+
+            newest(Path(cfg.init_from), "init_from")
+    if {*devices.values()} != {"cpu"}:  # torch takes seconds
+        with importing():
+            from trackmdp.training.devices import make_device
+
+        for key, name in devices.items():
+            make_device(name, key)
 
 
 def _check_runs(cfg: CommandConfig, runs: Sequence[str], words: Sequence[str]) -> None:
