@@ -5,7 +5,6 @@ from __future__ import annotations
 import random
 import re
 import shutil
-import signal
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -19,9 +18,9 @@ from tests.training.runs import BUDGET, QUICK, SMALL, assert_same_run, at_iterat
 from tests.training.test_checkpoint import corrupted
 from trackmdp.app.cli import main
 from trackmdp.config import load_run_config, to_dict
-from trackmdp.errors import Preempted, RunError, UserError
+from trackmdp.errors import RunError, UserError
 from trackmdp.training import checkpoint
-from trackmdp.training.state import Checkpoints, find
+from trackmdp.training.state import find
 from trackmdp.world.model import World
 from trackmdp.world.problem_file import PROBLEM, problem_bytes, read_problem
 
@@ -111,64 +110,6 @@ def test_a_checkpoint_that_is_named_is_taken_or_refused(
     chosen.write_bytes(content)
     assert typed(half, f"resume={chosen}") == 0
     assert_same_run(half, whole)
-
-
-def test_checkpoints_after_a_named_one_are_not_gone_on_from(
-    half: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    chosen = half / "checkpoints" / "iteration-00000003.pt"
-    assert checkpoint.newest(half) > chosen
-    with monkeypatch.context() as patch:
-        at_iteration(patch, 4, breaks)
-        assert typed(half, f"resume={chosen}") == 1
-    assert checkpoint.newest(half) == chosen
-    assert typed(half, "resume=auto") == 0
-    assert_same_run(half, whole)
-
-
-def test_the_best_of_a_course_that_was_left_is_not_the_best(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The fourth was the best; back to the third, of which the first, long removed, was the best so far."""
-    folder, figures = tmp_path / "run", {1: 1e9, 2: 0.0, 3: 0.0, 4: 2e9}
-    chosen, best = (folder / "checkpoints" / name for name in ("iteration-00000003.pt", "best.pt"))
-    with monkeypatch.context() as patch, pytest.raises(RunError):
-        patch.setattr(
-            Checkpoints, "_attained", lambda _, trainer: figures[trainer.position.iteration]
-        )
-        at_iteration(patch, 5, breaks)
-        train(folder, "checkpoint.keep=3", "evaluation.every=1")
-    assert checkpoint.load(best)["iteration"] == 4
-    for words in (f"resume={chosen}", "resume=auto"):  # the second time, best.pt is the third
-        with monkeypatch.context() as patch:
-            at_iteration(patch, 4, breaks)
-            assert typed(folder, words, "evaluation.every=1") == 1
-        assert checkpoint.load(best)["iteration"] == 3
-    assert typed(folder, "resume=auto", "evaluation.every=1") == 0
-    judged = {int(row["iteration"]): float(row["aihtr"]) for row in rows(folder)[2:]}
-    first = max(judged, key=lambda iteration: judged[iteration])
-    assert checkpoint.load(best)["iteration"] == first
-    state = checkpoint.load(folder / "checkpoints" / checkpoint.LAST)
-    assert state["callbacks"]["checkpoints"]["best"] == judged[first]
-
-
-def test_no_best_is_left_where_no_checkpoint_counts_yet(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / "run"
-    chosen, best = (folder / "checkpoints" / name for name in ("iteration-00000001.pt", "best.pt"))
-    words = ("checkpoint.every=512", "checkpoint.keep=3")
-    with monkeypatch.context() as patch, pytest.raises(Preempted):
-        at_iteration(patch, 1, lambda: signal.raise_signal(signal.SIGTERM))
-        train(folder, *words)
-    with monkeypatch.context() as patch:
-        at_iteration(patch, 4, breaks)
-        assert typed(folder, "resume=auto") == 1
-    assert best.is_file()
-    with monkeypatch.context() as patch:
-        at_iteration(patch, 2, breaks)
-        assert typed(folder, f"resume={chosen}") == 1
-    assert not best.exists()
 
 
 def test_checkpoints_of_another_run_behind_a_link_stay(tmp_path: Path) -> None:

@@ -73,6 +73,18 @@ def available_checkpoints(folder: Path) -> list[Path]:
     )
 
 
+def remove_later(folder: Path, iteration: int) -> None:
+    """Remove the checkpoints after `iteration`, of a course of the run that was left; the newest first.
+
+    Before the logs are cut back to `iteration`: a run that is killed in between then resumes from where they end.
+    """
+    own_folder(folder)
+    for file in available_checkpoints(folder):
+        if file > named(folder, iteration):
+            file.unlink()
+    sync_folder(folder)
+
+
 def newest(run: Path, key: str = "run") -> Path:
     """The newest checkpoint of a run folder, which the option `key` names.
 

@@ -15,7 +15,6 @@ from torchrl.collectors import BaseCollector, Collector
 from trackmdp.algos.common import Algorithm
 from trackmdp.config import CheckpointConfig, TrainConfig
 from trackmdp.config.tree import flatten
-from trackmdp.durable import own_folder
 from trackmdp.errors import Preempted, UserError
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Position, Row, Training
@@ -203,17 +202,12 @@ class Checkpoints(Callback):
         self._is_best = False
 
     def on_start(self, trainer: Training) -> None:
-        """Intervals count from where the run is, and no checkpoint is later.
+        """Intervals count from where the run is.
 
         The process that wrote the checkpoint may have been killed before last.pt and best.pt were the same file.
         """
         self._saved = trainer.position
         file = checkpoint.named(self._folder, trainer.position.iteration)
-        own_folder(self._folder)
-        # Where an earlier one was named, these are of another course of the run, whose rows the logs have cut off.
-        for later in checkpoint.available_checkpoints(self._folder):
-            if later > file:
-                later.unlink()
         if trainer.position.iteration and file.is_file():
             self._put_best_right(trainer, file.with_name(checkpoint.BEST))
             checkpoint.point(file, best=self._is_best)

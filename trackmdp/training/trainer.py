@@ -19,6 +19,7 @@ from trackmdp.errors import Preempted, RunError
 from trackmdp.policies.policy import Policy
 from trackmdp.seeding import seed_global
 from trackmdp.signals import Signals, Watch
+from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Position, Row, Training
 from trackmdp.training.collect import make_collector
 from trackmdp.training.devices import check_memory, make_device
@@ -138,6 +139,7 @@ class Trainer(Training):
         self.start = self._restore(state)
         self.position, self.collecting = self.start, 0.0
         if folder is not None:
+            checkpoint.remove_later(folder / "checkpoints", self.start.iteration)
             write_inputs(config, problem, folder, resumed=state is not None)
             plan = {"iterations": self.iterations, "upper_bound": self.evaluator.upper}
             write_json(folder / "plan.json", plan)  # for `watch`
