@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 import os
 import re
 from contextlib import nullcontext
@@ -19,6 +20,7 @@ from trackmdp.recordings.positions import (
     NO_POSITION,
     REPEATED,
     Positions,
+    sumo,
 )
 from trackmdp.recordings.track_files import read_positions
 
@@ -158,6 +160,21 @@ def test_mot_stands_where_the_box_stands(tmp_path: Path) -> None:
     assert rows(found) == [(0, 0, 1, 5, 10), (1, 1, 1, 110, 110), (1, 1, 2, 120, 110)]
     assert found.downwards
     assert (found.dropped[IGNORED], found.dropped[NO_IDENTITY]) == (1, 1)
+
+
+def test_a_long_value_is_not_handed_to_the_parser_in_small_pieces() -> None:
+    """expat before 2.6 looks through it anew with each of them."""
+
+    class Counted(io.BytesIO):
+        reads = 0
+
+        def read(self, size: int | None = -1) -> bytes:
+            self.reads += 1
+            return super().read(size)
+
+    stream = Counted(SUMO.replace("<fcd-export", f'<fcd-export note="{"x" * 2**23}"', 1).encode())
+    assert np.array_equal(sumo(stream).x, [0.0, 1.5, 3.0, 9.0])
+    assert stream.reads <= 4
 
 
 def test_sumo(tmp_path: Path) -> None:

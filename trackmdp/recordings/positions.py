@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -98,10 +99,8 @@ def table_of(
     )
     frame["piece"] = piece
     # inf is no position either; AIS gives 91 and 181 degrees where the receiver of a ship knows none.
-    good = (
-        np.isfinite(frame[["time", "x", "y"]].to_numpy(dtype=np.float64)).all(axis=1)
-        & frame["id"].notna()
-    )
+    finite = np.isfinite(frame[["time", "x", "y"]].to_numpy(dtype=np.float64)).all(axis=1)
+    good = finite & frame["id"].notna()
     good &= ((frame["x"].abs() <= 180) & (frame["y"].abs() <= 90)) | (not are.get("geographic"))
     kept = frame[good].copy()
     kept["track"] = np.unique(kept["id"].astype(str), return_inverse=True)[1]
@@ -110,9 +109,8 @@ def table_of(
     once = ~kept.duplicated(["track", "piece", "time"])
     counts = {NO_POSITION: int((~good).sum()), REPEATED: int((~once).sum())}
     kept = kept[once].copy()
-    kept["piece"] = (
-        kept[["track", "piece"]].ne(kept[["track", "piece"]].shift()).any(axis=1).cumsum() - 1
-    )
+    pieces = kept[["track", "piece"]]
+    kept["piece"] = pieces.ne(pieces.shift()).any(axis=1).cumsum() - 1
     kinds = dict.fromkeys(("track", "piece"), np.int64) | dict.fromkeys(
         ("time", "x", "y"), np.float64
     )
@@ -380,7 +378,9 @@ def sumo(stream: BinaryIO) -> Positions:
 
     rows: list[tuple[Any, ...]] = []
     time, root = None, None
-    for event, element in iterparse(stream, events=("start", "end"), forbid_dtd=True):
+    # Not in pieces of 16 KiB, as iterparse asks for: expat before 2.6 looks through an unfinished value anew with each.
+    pieces = SimpleNamespace(read=lambda _: stream.read(2**22))
+    for event, element in iterparse(pieces, events=("start", "end"), forbid_dtd=True):
         if root is None:
             root = element
             if element.tag != "fcd-export":
