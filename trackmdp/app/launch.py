@@ -10,7 +10,7 @@ import io
 import shlex
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from contextlib import redirect_stdout
 from dataclasses import replace
 from functools import partial
@@ -93,9 +93,7 @@ def _run_once(compose: Composer) -> int:
         announce(ready)
         grids = OmegaConf.select(cfg, "hydra.sweeper.blocks")  # a single run does not read them
         if grids and not ready.cfg.quiet:
-            say(
-                f"one run with the defaults: -m is missing, which runs all {len(grids)} grids of this config"
-            )
+            say("one run with the defaults: -m is missing, which runs all that this config plans")
         _run_in_hydra(cfg, ready)
     finally:
         # A run that failed before its first file leaves nothing; one that wrote something keeps it.
@@ -154,6 +152,10 @@ def _sweep(compose: Composer) -> int:
         # A grid has been composed and checked to the last run by now; a search plans its runs as it goes.
         return sweep(place, command, line, batches, launch_jobs, console)
     finally:
+        if isinstance(
+            batches, Generator
+        ):  # a search lets go of its study, which it no longer can at Python's end
+            batches.close()
         remove_if_empty(made)
 
 

@@ -68,6 +68,19 @@ def test_a_signal_is_told_to_the_runs_and_ends_the_sweep(tmp_path: Path) -> None
     assert states(tmp_path) == ["waiting"]
 
 
+def test_a_fork_server_that_loads_ignores_the_signals_of_its_group(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ctrl-C while it imports torch would end it with a traceback."""
+    seen: list[object] = []
+    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+    monkeypatch.setattr(
+        process.forkserver, "ensure_running", lambda: seen.extend(map(signal.getsignal, signals))
+    )
+    process.context_for("train")
+    assert seen == [signal.SIG_IGN] * len(signals)
+
+
 def test_a_run_whose_process_cannot_start_is_told_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

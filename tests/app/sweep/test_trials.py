@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
+import signal
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +14,7 @@ import pytest
 from tests.app.sweep.runs import TINY, here, runs_of, states, swept, table
 from tests.typed import stub
 from trackmdp.app.cli import main
-from trackmdp.errors import adding
+from trackmdp.errors import Preempted, adding
 from trackmdp.training.folders import run_of
 
 __all__ = ["here"]
@@ -56,6 +59,21 @@ def test_words_with_many_values_are_searched(here: Path, monkeypatch: pytest.Mon
     )
     assert {hidden for _, _, hidden, _ in found} == {8, 16}
     assert (here / "all/study.db").is_file()
+
+
+def test_a_search_that_ends_early_lets_go_of_its_study(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[Generator[Any, None, None]] = []
+
+    def cut(*given: Any) -> int:
+        begun.append(given[3])
+        next(begun[0])
+        raise Preempted(signal.SIGINT)
+
+    monkeypatch.setattr("trackmdp.app.sweep.sweep.sweep", cut)
+    assert searched("hydra.sweeper.n_trials=2") == 128 + signal.SIGINT
+    assert inspect.getgeneratorstate(begun[0]) == inspect.GEN_CLOSED
 
 
 @pytest.mark.slow

@@ -49,7 +49,7 @@ _start_or_join = threading.RLock()
 _POLL = 0.2
 _LOST = 255
 """Exit status that `multiprocessing` gives to a process without its fork server."""
-_TERMINATING = (signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
+_TERMINATING = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 
 
 def run_in_process(job: Job, stop: Callable[[], int]) -> int:
