@@ -59,14 +59,17 @@ def test_a_run_that_is_cut_goes_on_as_one_that_was_not(
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "cut" / name).read_bytes()
 
 
-def test_a_loaded_run_acts_and_is_valued_as_it_was(tmp_path: Path) -> None:
+def test_a_loaded_run_acts_and_is_valued_as_it_was(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = tm.train(group(), "a2c", folder=tmp_path / "a", **FEW, **BRIEF)
     loaded = tm.load_run(tmp_path / "a")
     again = evaluate(group(), loaded, width=0.2)
     assert again.aihtr.mean == run.evaluation.aihtr == loaded.evaluation.aihtr
     assert run.summary["several"]["figures"]["aihtr"]["mean"] == again.aihtr.mean
-    words = ["evaluate", f"run={tmp_path / 'a'}", "evaluation.width=0.2", "quiet=true"]
+    words = ["evaluate", f"run={tmp_path / 'a'}", "evaluation.width=0.2"]
     assert main(words) == 0
+    assert ", 2 targets, learned together" in capsys.readouterr().out
     written = json.loads((tmp_path / "a" / "evaluation.json").read_text(encoding="utf-8"))
     assert written["figures"]["aihtr"]["mean"] == again.aihtr.mean
     assert written["merge"] == "joint"
@@ -259,6 +262,8 @@ def test_a_tracker_begins_with_each_target_in_its_cell() -> None:
 
 def test_a_loaded_run_follows_targets_step_by_step(tmp_path: Path) -> None:
     run = tm.train(group(), "a2c", folder=tmp_path, **FEW, **BRIEF)
+    with pytest.raises(UserError, match="several targets learned together: load_run reads them"):
+        tm.Tracker(tmp_path / "policy.npz", 0)
     tracker = tm.load_run(tmp_path).policy.tracker([0, 4])
     episode = next(e for e in tm.simulate(group(), run, 300) if e.start.tolist() == [0, 4])
     for t in range(len(episode)):
@@ -267,6 +272,19 @@ def test_a_loaded_run_follows_targets_step_by_step(tmp_path: Path) -> None:
         seen = zip(episode.target[t].tolist(), episode.located[t], strict=True)
         gone = np.flatnonzero(episode.target[t] == 9)
         tracker.report([cell if found else None for cell, found in seen], gone.tolist())
+
+
+@pytest.mark.parametrize("loaded", [True, False])
+def test_a_plan_learned_for_one_follows_several(loaded: bool, tmp_path: Path) -> None:
+    """By the sets of all together, as the run's figures have it."""
+    few = {name: each for name, each in FEW.items() if name != "hidden"}
+    union = {**few, **BRIEF, "targets.merge": "union"}
+    run = tm.train(group(), "model_based", folder=tmp_path, **union)
+    tracker = (tm.load_run(tmp_path) if loaded else run).tracker([0, 4])
+    own = (run.policy.tracker(cell).sensors() for cell in (0, 4))
+    assert tracker.sensors() == sorted({sensor for sensors in own for sensor in sensors})
+    with pytest.raises(UserError, match="a run of one target"):
+        tm.train(tm.make_world(size=3), "model_based", **few).tracker([0, 4])
 
 
 def test_runs_for_several_targets_are_compared_on_the_same_targets(tmp_path: Path) -> None:

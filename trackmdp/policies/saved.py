@@ -51,6 +51,8 @@ def load_policy(file: Path) -> tuple[PolicyTable, Array | None]:
     """
     with opened(file, most=LARGE) as stream, decoded(str(file), "a policy"):
         content = load_npz(stream)
+        if "targets" in content:
+            raise ValueError("the weights of several targets learned together: load_run reads them")
         own = {name: array for name, array in content.items() if name.startswith(_TASK)}
         task = Task(**from_arrays({name.removeprefix(_TASK): own[name] for name in own}))
         value = content.get("value")

@@ -7,7 +7,7 @@ import json
 import math
 import platform
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -30,6 +30,7 @@ from trackmdp.policies.saved import load_policy
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import group_rule
 from trackmdp.solvers.evaluation import Evaluation, figures
+from trackmdp.solvers.several.group_tracker import GroupTracker
 from trackmdp.solvers.solution import Solution
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Learning, Row, Training
@@ -80,6 +81,23 @@ class Run(Carded):
         from pandas import DataFrame
 
         return DataFrame(self.columns)
+
+    def tracker(self, cells: Sequence[int]) -> GroupTracker:
+        """A tracker that follows the run's several targets, located in `cells`, as its figures have it.
+
+        Raises:
+            UserError: the run is of one target, or these are other cells than one of the grid for each target.
+        """
+        merge: str | None
+        if self.several is not None:
+            group, merge = self.several.group, self.several.merge
+        else:
+            cfg = None if self.folder is None else load_run_config(self.folder)
+            if cfg is None or self.folder is None or cfg.targets.count == 1:
+                raise UserError("tracker: a run of one target, expected run.policy.tracker(cell)")
+            group = group_of(problem_of(cfg, self.folder), cfg.targets.count)
+            merge = cfg.targets.merge
+        return GroupTracker(group_rule(group, self.policy, merge), cells)
 
     def card(self) -> Card:
         """Algorithm, budget, figures, bound and folder."""

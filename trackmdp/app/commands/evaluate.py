@@ -141,7 +141,8 @@ def _several(
     ]
     rows += [] if apart is None else [["AIHTR of separate trackers", f"{apart:,.4f}"]]
     rows += [] if recorded else [["upper bound", f"{upper:,.4f}"]]
-    at.print(table(f"{subject}, {len(group)} targets, {rule.name}", ["figure", found.about], rows))
+    how = f"merged by {rule.name}" if rule.tables else "learned together"
+    at.print(table(f"{subject}, {len(group)} targets, {how}", ["figure", found.about], rows))
     below = f"{(upper - found.aihtr.mean) / found.expected_length:.4f} per step below the bound; "
     at.print(f"{'' if recorded else below}results in {folder}")
     shown = (cfg.episodes if cfg.log else 0) or _FOR_THE_PICTURE
