@@ -35,7 +35,7 @@ def test_the_runs_of_an_experiment_are_accepted(name: str) -> None:
 def test_a_single_run_of_an_experiment_names_the_runs_left_out(
     capsys: pytest.CaptureFixture[str], empty_folder: Path
 ) -> None:
-    """One line after the first says that the grids of runs need -m."""
+    """One line after the first says that the sweep needs -m."""
     tiny = (
         "grid.size=3 algo=model_based collector.total_frames=1000 collector.frames_per_batch=1000"
     )

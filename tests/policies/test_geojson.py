@@ -109,6 +109,9 @@ def test_what_cannot_be_exported_is_one_line(world: tm.World, tmp_path: Path) ->
         tm.export(tm.Policy.none(world), tmp_path / "a.pkl")
     with pytest.raises(UserError, match="a World, expected a policy of one target"):
         tm.export(world, tmp_path / "a.onnx")
+    several = tm.solve(tm.Group([world, world]))
+    with pytest.raises(UserError, match="export: a Merged, expected a policy of one target"):
+        tm.export(several, tmp_path / "a.onnx")
 
 
 @pytest.mark.parametrize(

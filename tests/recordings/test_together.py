@@ -272,7 +272,7 @@ def test_policies_are_compared_over_groups_of_held_out_tracks() -> None:
     found = [evaluate(targets, name).totals[:, 0] for name in ("none", "all_on")]
     assert compared.about == f"{len(found[0])} groups of held-out tracks"
     assert compared.policies[1].difference.mean == pytest.approx((found[1] - found[0]).mean())
-    assert "per episode than none; 95 %" in compared.sentences[0]
+    assert "per group than none; 95 %" in compared.sentences[0]
 
 
 def test_tracks_of_several_targets_from_a_file(tmp_path: Path) -> None:

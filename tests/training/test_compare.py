@@ -134,6 +134,15 @@ def test_a_run_with_the_name_of_a_baseline_is_not_replaced_by_it(empty_folder: P
 
 
 @pytest.mark.usefixtures("empty_folder")
+def test_a_run_on_another_grid_is_refused_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    tm.train(WORLD, "model_based", folder="a", **FEW)
+    tm.train(small_world(4), "model_based", folder="b", **FEW)
+    assert main(["compare", "run=a", "run=b"]) == 2
+    said = "trackmdp compare: b (other problem): policy: made for 4 x 4 cells"
+    assert capsys.readouterr().err.startswith(said)
+
+
+@pytest.mark.usefixtures("empty_folder")
 @pytest.mark.parametrize(
     ("words", "message"),
     [

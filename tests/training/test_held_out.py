@@ -30,6 +30,7 @@ from trackmdp.training.evaluator import (
     ESTIMATED,
     ExactEvaluator,
     HeldOutEvaluator,
+    Score,
     estimated_kernel,
 )
 from trackmdp.training.folders import run_of
@@ -42,6 +43,14 @@ def test_the_setting_decides_who_evaluates() -> None:
     world = small_world()
     assert type(evaluator_of(world, 0)) is ExactEvaluator
     assert type(evaluator_of(recorded(drawn(world.kernel, 5)), 0)) is HeldOutEvaluator
+
+
+def test_a_regret_says_where_no_better_policy_is_known() -> None:
+    found = ExactEvaluator(small_world()).evaluate(Policy.none(small_world()))
+    last = "0.1700 to the upper bound"
+    assert Score(found, 0.17, 0.0).regret == f"regret per step {last}; no better policy is known"
+    assert Score(found, 0.17, 0.05).regret.endswith(f"0.0500 to the best policy known, {last}")
+    assert Score(found, 0.17, 0.17).regret == f"regret per step {last}"
 
 
 def test_only_the_held_out_tracks_count() -> None:

@@ -112,7 +112,9 @@ def _report(command: str, error: BaseException) -> int:
         traceback.print_exception(error)
         return status
     name = f"trackmdp {command}" if command in COMMANDS else "trackmdp"
-    sys.stderr.write(f"{name}: {printable(' '.join(line.split()))}\n")
+    # What Python calls by the command's name begins its messages with it.
+    said = printable(" ".join(line.split())).removeprefix(f"{command}: ")
+    sys.stderr.write(f"{name}: {said}\n")
     return status
 
 

@@ -107,7 +107,7 @@ def manual(command: str, words: Sequence[str] = ()) -> str:
         for group, names in typed.items():
             for name in _names(names):
                 blocks += [*_example(command, chosen, group, name), *_choice(group, name)]
-        return "\n".join([*blocks, "", f"trackmdp {command} --help lists every other option.", ""])
+        return "\n".join([*blocks, "", f"trackmdp {command} --help all lists every option.", ""])
     blocks += ["Examples", *(f"  {line}" for line in EXAMPLES[command]), ""]
     for flag, text in _FLAGS.items():
         blocks += _described(flag, text)
@@ -143,7 +143,9 @@ def _offered(group: str, values: dict[str, Any]) -> str:
     default = "none chosen"
     if (node := values[group]) is not None:
         default = node["name"] if "name" in node else listed(node)
-    return f"{group}={'|'.join(GROUPS[group])} (default: {default})"
+    # `given` stands for a problem made in Python, and cannot be typed.
+    names = [name for name in GROUPS[group] if name != "given"]
+    return f"{group}={'|'.join(names)} (default: {default})"
 
 
 def _all(command: str, values: dict[str, Any]) -> Iterator[str]:

@@ -19,7 +19,7 @@ class PartitionConfig(NodeConfig):
         ge=0,
     )
     workers: int = count_option(
-        "processes that plan or learn, or with a cluster of our own its cores; on one machine as many as it has cores",
+        "processes that plan or learn, best as many as the machine has cores; with partition.cluster=local its cores",
         unit="processes",
         le=1024,
     )

@@ -51,8 +51,9 @@ def export(policy: Any, file: str | Path, *, value: Array | None = None, label: 
     """
     place, table = output_of(file, "export"), adapted(None, policy)
     if not isinstance(table, PolicyTable):
+        held = type(getattr(policy, "policy", policy)).__name__
         raise UserError(
-            f"export: a {type(policy).__name__}, expected a policy of one target: a Policy, a Run or a Solution"
+            f"export: a {held}, expected a policy of one target: a Policy, a Run or a Solution"
         )
     if value is None:
         value = getattr(getattr(policy, "evaluation", None), "value", None)

@@ -87,7 +87,7 @@ class Comparison(Carded):
         """The conclusion for each policy but the first."""
         first, *others = self.policies
         exact = self.tracks is None
-        unit = "episode" if exact or self.units != ("held-out track",) else "track"
+        unit = "episode" if exact else self.units[0].split()[-1]
         return [_sentence(first, each, unit, exact=exact) for each in others]
 
 

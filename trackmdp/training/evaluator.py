@@ -54,6 +54,8 @@ class Score:
         )
         if high <= low or math.isnan(self.regret_per_step):
             return f"regret per step {high} to the upper bound"
+        if self.regret_per_step_lower <= 0.0:
+            return f"regret per step {high} to the upper bound; no better policy is known"
         return f"regret per step {low} to the best policy known, {high} to the upper bound"
 
 
