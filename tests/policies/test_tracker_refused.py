@@ -27,6 +27,7 @@ MISTAKES: dict[str, tuple[Any, str]] = {
     "after the exit": (lambda t: (t.exited(), t.report(0)), "report: the target has exited"),
     "start": (lambda _: begun(mode=1), "tracker: mode=1, expected none"),
     "seed": (lambda _: begun(seed=-1), "tracker: seed=-1: expected an integer >= 0"),
+    "file": (lambda _: tm.Tracker("a/sets.json", 0), "tracker: a/sets.json: expected a policy.npz"),
 }
 
 

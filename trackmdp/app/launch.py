@@ -152,9 +152,8 @@ def _sweep(compose: Composer) -> int:
         # A grid has been composed and checked to the last run by now; a search plans its runs as it goes.
         return sweep(place, command, line, batches, launch_jobs, console)
     finally:
-        if isinstance(
-            batches, Generator
-        ):  # a search lets go of its study, which it no longer can at Python's end
+        # A search lets go of its study, which it no longer can at Python's end.
+        if isinstance(batches, Generator):
             batches.close()
         remove_if_empty(made)
 

@@ -350,7 +350,9 @@ def _plan(policy: Plan | str | Path) -> Plan:
                 f"tracker: a {type(policy).__name__}, expected a policy of one target, or its file"
             )
         return policy
-    return OnnxTable(policy) if Path(policy).suffix == ".onnx" else load_policy(Path(policy))[0]
+    if (kind := Path(policy).suffix) not in (".npz", ".onnx"):
+        raise UserError(f"tracker: {policy}: expected a policy.npz or a policy.onnx")
+    return OnnxTable(policy) if kind == ".onnx" else load_policy(Path(policy))[0]
 
 
 def _checked(world: Any, task: Task) -> Any:

@@ -88,16 +88,14 @@ class Run(Carded):
         Raises:
             UserError: the run is of one target, or these are other cells than one of the grid for each target.
         """
-        merge: str | None
         if self.several is not None:
-            group, merge = self.several.group, self.several.merge
-        else:
-            cfg = None if self.folder is None else load_run_config(self.folder)
-            if cfg is None or self.folder is None or cfg.targets.count == 1:
-                raise UserError("tracker: a run of one target, expected run.policy.tracker(cell)")
+            return GroupTracker(
+                group_rule(self.several.group, self.policy, self.several.merge), cells
+            )
+        if self.folder is not None and (cfg := load_run_config(self.folder)).targets.count > 1:
             group = group_of(problem_of(cfg, self.folder), cfg.targets.count)
-            merge = cfg.targets.merge
-        return GroupTracker(group_rule(group, self.policy, merge), cells)
+            return GroupTracker(group_rule(group, self.policy, cfg.targets.merge), cells)
+        raise UserError("tracker: a run of one target, expected run.policy.tracker(cell)")
 
     def card(self) -> Card:
         """Algorithm, budget, figures, bound and folder."""
