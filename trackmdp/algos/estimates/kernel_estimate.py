@@ -164,6 +164,7 @@ class KernelEstimate:
         counts = self._pooled()
         exits, moved = self._exits(counts), counts[:, :-1]
         moved.eliminate_zeros()
+        moved.sort_indices()  # `moved > 0` does, and `likely` is in the order of the entries
         rows, out = row_index(moved), moved.sum(axis=1)
         likely, seldom = np.zeros_like(moved.data), self._seldom(moved)
         for group in (seldom, ~seldom):
