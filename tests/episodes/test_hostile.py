@@ -176,7 +176,9 @@ def zeros(size: int, said: bool) -> bytes:
 def test_a_chunk_beyond_the_limit_is_not_unpacked(
     size: int, said: bool, claims: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(container, "breakup_chunk", lambda *_, **__: pytest.fail("unpacked"))
+    monkeypatch.setattr(
+        container, "get_chunk_data_stream", lambda *_, **__: pytest.fail("unpacked")
+    )
     with pytest.raises(Damaged):
         container.messages_of(chunk(zeros(size, said), claims), {})
 
@@ -190,6 +192,13 @@ def test_other_compressions_and_chunks_without_a_checksum_are_refused() -> None:
     for bad in (chunk(b"", 0, "lz4"), replace(chunk(b"", 0, ""), uncompressed_crc=0)):
         with pytest.raises(Damaged):
             container.messages_of(bad, {})
+
+
+def test_a_record_that_reaches_beyond_its_chunk_is_refused() -> None:
+    content = struct.pack("<BQ", Opcode.MESSAGE, 100) + bytes(40)
+    bad = replace(chunk(content, len(content), ""), uncompressed_crc=zlib.crc32(content))
+    with pytest.raises(Damaged, match="a record of a chunk"):
+        container.messages_of(bad, {0: "/step"})
 
 
 def test_a_sparse_file_of_two_gigabytes_is_over_at_once(log: Path, tmp_path: Path) -> None:
