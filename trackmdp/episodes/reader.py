@@ -176,7 +176,8 @@ class EpisodeReader:
 BELIEF_TOLERANCE = 1e-6
 """How far the belief may be off where other versions wrote the log; all else must still be the same to the bit."""
 
-_AT_ONCE = 256  # episodes simulated together: a step of 64 takes nearly as long
+_AT_ONCE, _CELLS = 256, 2**22
+"""Episodes simulated together, since a step of fewer takes nearly as long, and their cells; at least 64 episodes."""
 
 
 @dataclass(frozen=True)
@@ -200,10 +201,11 @@ def verify(reader: EpisodeReader, *, numbers: list[int] | None = None) -> Verifi
     # The belief is a sum of products, which another version or processor may add up in another order.
     tolerance = BELIEF_TOLERANCE if versions_apart(reader.run.said) else 0.0
     world, done, steps = reader.world(), 0, 0
+    at_once = max(64, min(_AT_ONCE, _CELLS // world.task.num_cells))
     for number, group in groupby(rows, lambda row: row["policy"]):
         policy, mine = reader.policy(number), list(group)
-        for begin in range(0, len(mine), _AT_ONCE):
-            some = mine[begin : begin + _AT_ONCE]
+        for begin in range(0, len(mine), at_once):
+            some = mine[begin : begin + at_once]
             again = resimulate(world, policy, [int(row["seed"]) for row in some]).complete()
             for row, one in zip(some, again, strict=True):
                 logged = reader.read(row["episode"])
