@@ -79,10 +79,11 @@ def remove_later(folder: Path, iteration: int) -> None:
     Before the logs are cut back to `iteration`: a run that is killed in between then resumes from where they end.
     """
     own_folder(folder)
-    for file in available_checkpoints(folder):
-        if file > named(folder, iteration):
-            file.unlink()
-    sync_folder(folder)
+    later = [file for file in available_checkpoints(folder) if file > named(folder, iteration)]
+    for file in later:
+        file.unlink()
+    if later:
+        sync_folder(folder)
 
 
 def newest(run: Path, key: str = "run") -> Path:
