@@ -83,9 +83,9 @@ def test_text_that_is_no_json_is_refused_in_one_line(text: str) -> None:
 
 def test_a_summary_of_900_levels_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text('{"a":' * 900 + "1" + "}" * 900)
-    with pytest.raises(UserError) as refused:
+    # Python 3.13 reads them all, and then the digest is missing.
+    with pytest.raises(UserError, match=r"^x: [^\n]*(\)|not by this program)\Z"):
         untrusted.unsealed(untrusted.read_object(tmp_path / "x.json"), "x")
-    assert str(refused.value).startswith("x: ") and "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
