@@ -78,6 +78,10 @@ def killed() -> None:
     raise Killed
 
 
+def breaks() -> None:
+    raise OSError(5, "Input/output error")
+
+
 def killed_and_resumed(folder: Path, iteration: int, *overrides: str, algo: str = "ppo") -> None:
     """A run that ends once this iteration is recorded, before its checkpoint, and goes on."""
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):

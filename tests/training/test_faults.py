@@ -22,7 +22,16 @@ import torch
 
 import trackmdp as tm
 from tests.helpers import train_config
-from tests.training.runs import BUDGET, QUICK, SMALL, assert_same_run, at_iteration, rows, train
+from tests.training.runs import (
+    BUDGET,
+    QUICK,
+    SMALL,
+    assert_same_run,
+    at_iteration,
+    breaks,
+    rows,
+    train,
+)
 from trackmdp import signals
 from trackmdp.algos.common import make_algorithm
 from trackmdp.errors import Preempted, RunError, UserError
@@ -134,9 +143,6 @@ def test_a_signal_ends_the_run_after_its_iteration_is_saved(
 def test_rows_written_after_the_checkpoint_are_cut_off(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, Path]
 ) -> None:
-    def breaks() -> None:
-        raise OSError(5, "Input/output error")
-
     with monkeypatch.context() as patch:
         at_iteration(patch, 5, breaks)
         with pytest.raises(RunError, match="Input/output error"):

@@ -8,17 +8,13 @@ from typing import Any
 
 import pytest
 
-from tests.training.runs import Killed, assert_same_run, at_iteration, killed, rows, train
+from tests.training.runs import Killed, assert_same_run, at_iteration, breaks, killed, rows, train
 from trackmdp.errors import Preempted, RunError
 from trackmdp.training import checkpoint
 from trackmdp.training.loggers import CsvLogger
 from trackmdp.training.state import Checkpoints
 
 KEEP = "checkpoint.keep=3"
-
-
-def breaks() -> None:
-    raise OSError(5, "Input/output error")
 
 
 def broken(folder: Path, patch: pytest.MonkeyPatch, iteration: int, *words: str) -> Path:

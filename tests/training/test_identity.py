@@ -13,7 +13,7 @@ import torch
 from torchrl.collectors import Collector
 
 from tests.helpers import small_world
-from tests.training.runs import assert_same_run, at_iteration, tensors, train
+from tests.training.runs import assert_same_run, at_iteration, breaks, tensors, train
 from trackmdp.algos.moves import MoveBuffer
 from trackmdp.errors import Preempted, RunError, UserError
 from trackmdp.training import checkpoint, state
@@ -21,10 +21,6 @@ from trackmdp.training.run import trained
 from trackmdp.world.problem_file import PROBLEM, problem_bytes
 
 CPU = torch.device("cpu")
-
-
-def breaks() -> None:
-    raise OSError(5, "Input/output error")
 
 
 def assert_same_best(one: Path, other: Path) -> None:

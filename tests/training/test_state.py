@@ -14,7 +14,16 @@ import pytest
 import torch
 
 from tests.helpers import train_config
-from tests.training.runs import BUDGET, QUICK, SMALL, assert_same_run, at_iteration, rows, train
+from tests.training.runs import (
+    BUDGET,
+    QUICK,
+    SMALL,
+    assert_same_run,
+    at_iteration,
+    breaks,
+    rows,
+    train,
+)
 from tests.training.test_checkpoint import corrupted
 from trackmdp.app.cli import main
 from trackmdp.config import load_run_config, to_dict
@@ -25,10 +34,6 @@ from trackmdp.world.model import World
 from trackmdp.world.problem_file import PROBLEM, problem_bytes, read_problem
 
 CPU = torch.device("cpu")
-
-
-def breaks() -> None:
-    raise OSError(5, "Input/output error")
 
 
 @pytest.fixture(scope="module")
