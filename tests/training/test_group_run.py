@@ -296,7 +296,7 @@ def test_runs_for_several_targets_are_compared_on_the_same_targets(tmp_path: Pat
     merged = tm.train(targets, "model_based", folder=runs[1], **words, **BRIEF)
     compared = tm.compare(targets, {"joint": joint, "merged": merged, "again": joint})
     assert compared.tracks is not None
-    assert "simulated episodes" in compared.about
+    assert compared.about.endswith("simulated episodes, differences over the same targets")
     alone = [
         evaluate_group(group_rule(targets, each), episodes=compared.tracks)
         for each in (joint, merged)

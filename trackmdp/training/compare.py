@@ -190,7 +190,11 @@ def _of_group(group: Group, rules: Mapping[str, Rule]) -> Comparison:
         Compared(name, {key: getattr(each, key) for key in FIGURES}, each.less(first).aihtr)
         for name, each in found.items()
     )
-    return Comparison(rows, None if exact else len(first.totals), first.units)
+    units = first.units
+    if not exact and group.recorded is None:
+        # A figure that is exact, or has control variates, is no plain mean: differences are not those of the figures.
+        units = (*units, ", differences over the same targets")
+    return Comparison(rows, None if exact else len(first.totals), units)
 
 
 M = TypeVar("M")
