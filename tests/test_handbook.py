@@ -47,6 +47,7 @@ WRITTEN = frozenset(
         "metrics.csv",
         "paper.json",
         "picture.txt",
+        "plan.json",
         "policy.npz",
         "problem.npz",
         "report.html",
