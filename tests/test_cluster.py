@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import sys
@@ -16,7 +17,8 @@ from tests.typed import refused
 from trackmdp.app.sweep import launchers
 from trackmdp.cluster import joining, ray_options
 from trackmdp.config.sweeping import RayConfig
-from trackmdp.errors import UserError
+from trackmdp.errors import Preempted, UserError
+from trackmdp.signals import handled, stop
 
 BLOCKS = "solve grid.size=4 partition.block=2"
 
@@ -108,3 +110,20 @@ def test_sigterm_that_ray_took_over_acts_as_before(error: type[Exception] | None
         assert signal.getsignal(signal.SIGTERM) == before
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@pytest.mark.parametrize("ends", [SystemExit(15), KeyboardInterrupt(), None])
+def test_sigterm_while_ray_starts_acts_as_before(ends: BaseException | None) -> None:
+    """Ray's own handlers exit, and its waits turn any exit into a KeyboardInterrupt."""
+
+    def of_ray(*_: object) -> None:
+        if ends is not None:
+            raise ends
+
+    with (
+        handled(stop, signal.SIGTERM),
+        pytest.raises(Preempted, match="signal 15"),
+        joining("x", None),
+    ):
+        signal.signal(signal.SIGTERM, of_ray)
+        os.kill(os.getpid(), signal.SIGTERM)

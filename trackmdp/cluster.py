@@ -12,7 +12,7 @@ from typing import Any
 
 from trackmdp.errors import UserError
 from trackmdp.imports import safe_children
-from trackmdp.signals import handled
+from trackmdp.signals import kept
 from trackmdp.untrusted import reason
 
 ADDRESS = r"auto|(\[[\da-fA-F:.]+\]|[\w.-]+):\d{1,5}"
@@ -32,11 +32,7 @@ def joining(key: str, address: str | None) -> Iterator[None]:
         _reach(os.environ.get("RAY_ADDRESS") if address == "auto" else address)
         # Ray installs a handler of its own, which exits: a run would end without its checkpoint. And it puts the
         # present current folder first on its workers' path: a `random.py` there would run in them.
-        with (
-            handled(signal.getsignal(signal.SIGTERM), signal.SIGTERM),
-            safe_children(),
-            chdir(Path(__file__).parents[1]),
-        ):
+        with kept(signal.SIGTERM), safe_children(), chdir(Path(__file__).parents[1]):
             yield
     except (ConnectionError, ValueError, RuntimeError) as error:
         given, why = "null" if address is None else address, reason(error)

@@ -38,6 +38,32 @@ def handled(handler: Any, *numbers: signal.Signals) -> Iterator[Mapping[signal.S
                 signal.signal(number, former)
 
 
+@contextmanager
+def kept(number: signal.Signals) -> Iterator[None]:
+    """Others may handle a signal inside; afterwards the handler from before does, also of one that came meanwhile.
+
+    Outside the main thread nothing is changed.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    # The numbers of signals that come are written here, whatever handles them.
+    came, note = os.pipe()
+    os.set_blocking(note, False)
+    former = signal.set_wakeup_fd(note, warn_on_full_buffer=False)
+    try:
+        with handled(signal.getsignal(number), number):
+            yield
+    finally:
+        signal.set_wakeup_fd(former)
+        os.write(note, b"\0")  # else reading would wait where none came
+        heard = os.read(came, 2**16)
+        os.close(came)
+        os.close(note)
+        if number in heard:
+            signal.raise_signal(number)
+
+
 class Signals(ExitStack):
     """While entered, SIGTERM, SIGINT and SIGUSR1 are noted in `received` instead of ending the process.
 
