@@ -15,7 +15,7 @@ from trackmdp.config.logs import (
     WandbConfig,
 )
 from trackmdp.config.option_fields import Option, option, refuse
-from trackmdp.config.options import GROUPS, ChoiceConfig, Node, NodeConfig, Sizes, choice, options
+from trackmdp.config.options import GROUPS, ChoiceConfig, Node, NodeConfig, choice, options
 from trackmdp.config.registry import conf_dir, load_plugins
 from trackmdp.config.roots import (
     ROOTS,

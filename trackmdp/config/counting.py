@@ -13,7 +13,7 @@ from trackmdp.config.option_fields import (
     refuse,
     share_option,
 )
-from trackmdp.config.options import BYTES, Sizes, choice
+from trackmdp.config.options import BYTES, choice
 
 
 @choice("algo", "model_based", makes="trackmdp.algos.model_based:ModelBased")
@@ -85,7 +85,7 @@ class ModelBasedConfig(EveryTaskConfig):
             found |= dict.fromkeys(("prior", "gamma"), "with algo.estimate=moves")
         return found
 
-    def needs(self, task: Sizes, root: Any) -> dict[str, int]:
+    def needs(self, task: Any, root: Any) -> dict[str, int]:
         """The paths, and the gains of each detection that may be on them; the table of chosen sets."""
         found = {"grid.size": renewed_table(task)} if self.chooses(root.cost.budget) else {}
         if task.markov or self.estimate == "moves":

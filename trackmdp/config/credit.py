@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 from trackmdp.config.learning import (
     ENTROPY,
@@ -13,7 +13,7 @@ from trackmdp.config.learning import (
     renewed_table,
 )
 from trackmdp.config.option_fields import TABLE, count_option, file_option, option, refuse
-from trackmdp.config.options import BYTES, Sizes, choice, nested
+from trackmdp.config.options import BYTES, choice, nested
 
 
 class PerSensorConfig(EveryTaskConfig):
@@ -23,7 +23,7 @@ class PerSensorConfig(EveryTaskConfig):
     course of the frames. Learning starts where it begins to change.
     """
 
-    effort: ClassVar[float] = 1.0
+    effort = 1.0
     collect: str = option(
         "all sensors on; or mixed with the policy learned so far, which costs less and shows less",
         choices=("all_on", "mixed"),
@@ -84,7 +84,7 @@ class PerSensorConfig(EveryTaskConfig):
         """All sensors on leave nothing to explore."""
         return {} if self.collect == "mixed" else {"explore": "with algo.collect=all_on"}
 
-    def needs(self, task: Sizes, root: Any) -> dict[str, int]:
+    def needs(self, task: Any, root: Any) -> dict[str, int]:
         """The moves kept, and their sorting; the paths of one update; the networks; the table that explores.
 
         A move is two cells of 16 bits. Where moves of different paths do not combine (`markov`), a third number

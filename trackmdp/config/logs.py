@@ -16,7 +16,7 @@ class LogConfig(ChoiceConfig):
     The code of a choice gets its config and the folder of the run, and returns a callback of the training.
     """
 
-    episodes_only: ClassVar[bool] = False
+    episodes_only = False
     package: ClassVar[str | None] = None
     """A package beyond the dependencies of trackmdp; the extra with the name of the choice adds it."""
 

@@ -50,31 +50,6 @@ BYTES = {"float32": 4, "int64": 8, "float64": 8, "int16": 2, "bool": 1}
 """Bytes of one number of each kind, for `needs`."""
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """The sizes of a task that `needs` may use, as `trackmdp.world.model.Task` has them.
-
-    Attributes:
-        num_cells: M.
-        num_sensors: K.
-        t_max: T_max.
-        num_choices: t_max + 1.
-        num_keys: plans of a policy.
-        keyed: whether a key is more than the cell.
-        order: detections before the last one that are remembered.
-        markov: whether moves of different paths combine.
-    """
-
-    num_cells: int
-    num_sensors: int
-    t_max: int
-    num_choices: int
-    num_keys: int
-    keyed: bool
-    order: int
-    markov: bool
-
-
 @dataclass_transform(
     kw_only_default=True,
     field_specifiers=(option, share_option, count_option, file_option, nested),
@@ -108,8 +83,13 @@ class NodeConfig:
         """
         return {}
 
-    def needs(self, task: Sizes, root: Any) -> dict[str, int]:
-        """Bytes that a run needs for this node, by the dotted option that they grow with."""
+    def needs(self, task: Any, root: Any) -> dict[str, int]:
+        """Bytes that a run needs for this node, by the dotted option that they grow with.
+
+        Args:
+            task: of the run, `trackmdp.sensing.task.Task`.
+            root: the config of the command.
+        """
         return {}
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 from trackmdp.config import counting, credit, given, hidden_kernels, sweeping  # noqa: F401  (more to choose from)
 from trackmdp.config.baselines import BaselineConfig
@@ -20,17 +20,17 @@ from trackmdp.errors import UserError
 class CommandConfig(NodeConfig):
     """Common options of all commands."""
 
-    learns: ClassVar[bool] = False
+    learns = False
     quiet: bool = option("print nothing but errors")
 
 
 class WorldConfig(CommandConfig):
     """Common options of the commands in a world."""
 
-    needs_motion: ClassVar[bool] = True
-    all_prices: ClassVar[bool] = False
+    needs_motion = True
+    all_prices = False
     """Whether the command sets the prices of sensors itself; those given are then ratios."""
-    any_number: ClassVar[bool] = False
+    any_number = False
     """Whether the command is about policies with any number of sensors on."""
     grid: GridConfig
     kernel: KernelConfig

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Any, ClassVar
+from typing import Any
 
 from trackmdp.config.option_fields import TABLE, Option, count_option, file_option, option, refuse
 from trackmdp.config.options import ChoiceConfig, choice, listed, require_able
@@ -109,7 +109,7 @@ class SensorConfig(ChoiceConfig):
     The code of a choice gets the size of the grid and the options of the choice, and returns arguments of `Task`.
     """
 
-    covers: ClassVar[bool] = False
+    covers = False
     """Whether a sensor covers a set of cells, so that there need not be one in each cell."""
 
     def count(self, grid: GridConfig) -> int | None:
