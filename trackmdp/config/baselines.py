@@ -7,8 +7,17 @@ from __future__ import annotations
 
 from typing import Any
 
-from trackmdp.config.option_fields import count_option, file_option, option, refuse, share_option
-from trackmdp.config.options import GROUPS, ChoiceConfig, choice, listed
+from trackmdp.config.options import (
+    GROUPS,
+    ChoiceConfig,
+    choice,
+    count_option,
+    file_option,
+    listed,
+    option,
+    refuse,
+    share_option,
+)
 from trackmdp.machine import SIZE_PATTERN
 
 

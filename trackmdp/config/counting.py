@@ -5,15 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 from trackmdp.config.learning import EveryTaskConfig, renewed_table
-from trackmdp.config.option_fields import (
+from trackmdp.config.options import (
+    BYTES,
     TABLE,
+    choice,
     count_option,
     file_option,
     option,
     refuse,
     share_option,
 )
-from trackmdp.config.options import BYTES, choice
 
 
 @choice("algo", "model_based", makes="trackmdp.algos.model_based:ModelBased")

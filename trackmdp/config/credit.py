@@ -12,8 +12,16 @@ from trackmdp.config.learning import (
     networks,
     renewed_table,
 )
-from trackmdp.config.option_fields import TABLE, count_option, file_option, option, refuse
-from trackmdp.config.options import BYTES, choice, nested
+from trackmdp.config.options import (
+    BYTES,
+    TABLE,
+    choice,
+    count_option,
+    file_option,
+    nested,
+    option,
+    refuse,
+)
 
 
 class PerSensorConfig(EveryTaskConfig):

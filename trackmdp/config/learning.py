@@ -5,8 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 from trackmdp.cluster import ADDRESS
-from trackmdp.config.option_fields import count_option, option, refuse, share_option
-from trackmdp.config.options import BYTES, ChoiceConfig, NodeConfig, choice, nested
+from trackmdp.config.options import (
+    BYTES,
+    ChoiceConfig,
+    NodeConfig,
+    choice,
+    count_option,
+    nested,
+    option,
+    refuse,
+    share_option,
+)
 
 MOST_FRAMES = 10**12
 """Most frames of a run: eleven days at a million frames per second. A larger number is a slip."""
@@ -90,13 +99,10 @@ class NetworkConfig(EveryTaskConfig):
         """Two networks and their optimiser; their hidden units for each target of a batch."""
         found, targets = {"algo.hidden": networks(task, self.hidden)}, together(root)
         if targets > 1:
-            rows = targets * self.learned_at_once(root)
+            # Frames that go through the networks together.
+            rows = targets * getattr(self, "batch_size", root.collector.frames_per_batch)
             found["targets.count"] = _PASSES * rows * self.hidden * BYTES["float32"]
         return found
-
-    def learned_at_once(self, root: Any) -> int:
-        """Frames that go through the networks together."""
-        return int(root.collector.frames_per_batch)
 
 
 class ActorCriticConfig(NetworkConfig):
@@ -172,16 +178,12 @@ class DqnConfig(NetworkConfig):
         """The replay buffer with two states a transition; the networks."""
         # State and next state, the action's K bits as bools, two float32 and one flag (reward, discount,
         # terminated), an index.
-        states = 2 * state_bytes(task, together(root))
+        states = 2 * state_bytes(task, root)
         transition = states + task.num_sensors + 2 * BYTES["float32"] + 1 + BYTES["int64"]
         priority = BYTES["float64"] if self.prioritized.enabled else 0
         return super().needs(task, root) | {
             "algo.buffer_size": self.buffer_size * (transition + priority)
         }
-
-    def learned_at_once(self, root: Any) -> int:
-        """Frames that go through the networks together."""
-        return self.batch_size
 
 
 class CollectorConfig(ChoiceConfig):
@@ -196,11 +198,6 @@ class CollectorConfig(ChoiceConfig):
         "device the environments live on", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE
     )
 
-    @property
-    def stepped(self) -> int:
-        """Environments stepped together, in all workers."""
-        return self.envs
-
     def check(self, key: str, root: Any) -> None:
         """A batch is a whole number of steps of all environments, and a run at least one batch."""
         # Where the collector has the value of the algorithm, the algorithm's option is the one to change.
@@ -210,9 +207,10 @@ class CollectorConfig(ChoiceConfig):
         )
         # A batch is `[B, time]`, B environments for equally many steps: TorchRL would round it up, and the
         # frames collected would not be those of the config.
-        if self.frames_per_batch % self.stepped:
-            factors = f"{key}.envs" + (f" x {key}.workers" if self.stepped > self.envs else "")
-            expected = f"a multiple of {self.stepped} ({factors})"
+        stepped = self.envs * getattr(self, "workers", 1)
+        if self.frames_per_batch % stepped:
+            factors = f"{key}.envs" + (f" x {key}.workers" if stepped > self.envs else "")
+            expected = f"a multiple of {stepped} ({factors})"
             raise refuse(batch, self.frames_per_batch, expected)
         if self.total_frames < self.frames_per_batch:
             expected = f"at least {batch}={self.frames_per_batch}"
@@ -221,7 +219,7 @@ class CollectorConfig(ChoiceConfig):
     def needs(self, task: Any, root: Any) -> dict[str, int]:
         """Two batches: one is collected while the other is handed over."""
         number = BYTES["float32"]
-        state = state_bytes(task, together(root))
+        state = state_bytes(task, root)
         frame = 2 * (state + 3) + task.num_sensors + number * (task.num_sensors + 2)
         return {"collector.frames_per_batch": 2 * self.frames_per_batch * frame}
 
@@ -236,11 +234,6 @@ class WorkersConfig(CollectorConfig):
 
     workers: int = count_option("worker processes", le=256)
     threads: int = count_option("torch threads of each worker process", unit="threads", le=256)
-
-    @property
-    def stepped(self) -> int:
-        """Environments stepped together, in all workers."""
-        return self.envs * self.workers
 
 
 @choice("collector", "multi_sync", makes="trackmdp.training.collect:multi_sync")
@@ -281,11 +274,12 @@ def together(root: Any) -> int:
     return int(root.targets.count) if root.algo.joint else 1
 
 
-def state_bytes(task: Any, targets: int = 1) -> int:
+def state_bytes(task: Any, root: Any) -> int:
     """Bytes of one observation: located cell, misses, the key where there is one, the actions since the detection.
 
     Of several targets cell and misses are those of each, and whether it is in the grid is observed too.
     """
+    targets = together(root)
     each = (2 + task.keyed) * BYTES["int64"] + (targets > 1)
     return targets * each + task.num_choices * task.num_sensors
 

@@ -4,13 +4,22 @@ from __future__ import annotations
 
 from typing import Any
 
-from trackmdp.config import counting, credit, given, hidden_kernels, sweeping  # noqa: F401  (more to choose from)
+from trackmdp.config import counting, credit, hidden_kernels, sweeping  # noqa: F401  (more to choose from)
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.by_blocks import PartitionConfig, SweptPartitionConfig
 from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig
 from trackmdp.config.logs import LogConfig
-from trackmdp.config.option_fields import count_option, file_option, option, refuse, share_option
-from trackmdp.config.options import GROUPS, NodeConfig, listed, options
+from trackmdp.config.options import (
+    GROUPS,
+    NodeConfig,
+    count_option,
+    file_option,
+    listed,
+    option,
+    options,
+    refuse,
+    share_option,
+)
 from trackmdp.config.sensors import CostConfig, SensorConfig
 from trackmdp.config.several import MergedTargetsConfig, TargetsConfig, WidthConfig
 from trackmdp.config.world import GridConfig, KernelConfig, TaskConfig
@@ -36,12 +45,6 @@ class WorldConfig(CommandConfig):
     kernel: KernelConfig
     cost: CostConfig
     sensor: SensorConfig
-
-    @property
-    def remembered(self) -> dict[str, Any]:
-        """Memory of policies, as arguments of `Task`; the cell, where the command has no options of it."""
-        task: TaskConfig | None = getattr(self, "task", None)
-        return {} if task is None else {"memory": task.memory, "clip": task.clip}
 
 
 class EvaluationConfig(WidthConfig):
@@ -210,11 +213,6 @@ class FrontierConfig(WorldConfig):
     resolution: float = option(
         "height above an edge below which no further corner is looked for, in accuracy", gt=0, lt=1
     )
-
-    def check(self, key: str, root: Any) -> None:
-        """Whole episodes alone are solved."""
-        if self.grid.max_steps is not None:
-            raise refuse("grid.max_steps", self.grid.max_steps, "null: whole episodes are solved")
 
 
 class VerifyConfig(WorldConfig):

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from trackmdp.cluster import ADDRESS, joining
-from trackmdp.config.option_fields import count_option, option
-from trackmdp.config.options import ChoiceConfig, choice
+from trackmdp.config.options import ChoiceConfig, choice, count_option, option
 from trackmdp.errors import UserError, require
 
 PLUGINS = ("launcher", "sweeper")

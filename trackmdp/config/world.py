@@ -4,8 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
-from trackmdp.config.option_fields import count_option, file_option, option, refuse, share_option
-from trackmdp.config.options import ChoiceConfig, NodeConfig, choice, require_able
+from trackmdp.config.options import (
+    ChoiceConfig,
+    NodeConfig,
+    choice,
+    count_option,
+    file_option,
+    option,
+    refuse,
+    require_able,
+    share_option,
+)
 from trackmdp.errors import UserError
 
 BORDERS = ("renormalize", "inside", "clip", "exit")
@@ -133,11 +142,6 @@ class KernelConfig(ChoiceConfig):
     hides = False
     """Whether the target has a mode beside its cell (`trackmdp.config.hidden_kernels`)."""
 
-    @property
-    def source(self) -> str:
-        """First words of a message about the kernel."""
-        return f"kernel={self.name}"
-
 
 class ExitingConfig(KernelConfig):
     """Common options of the kernels of moves around each cell."""
@@ -197,11 +201,6 @@ class TableConfig(KernelConfig):
     """A table of your own: row i holds the probabilities of moving from cell i to each cell."""
 
     path: str = file_option("file with the M x M table", "a path to a .npy, .npz or .csv file")
-
-    @property
-    def source(self) -> str:
-        """First words of a message about the kernel."""
-        return f"kernel.path={self.path}"
 
 
 @choice("kernel", "tracks", makes="trackmdp.world.configured:recorded")

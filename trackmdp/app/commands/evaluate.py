@@ -13,7 +13,6 @@ from rich.console import Console
 from rich.table import Table
 
 from trackmdp.app.commands.evaluate_false_alarms import evaluate_believed
-from trackmdp.app.commands.evaluate_playback import evaluate_playback
 from trackmdp.config import (
     EvaluateConfig,
     FalseAlarmConfig,
@@ -26,9 +25,12 @@ from trackmdp.durable import write_json, write_text
 from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.player import draw_picture
-from trackmdp.episodes.simulate import simulate
+from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.simulate import resimulate, simulate
 from trackmdp.episodes.simulated_figures import Simulation
-from trackmdp.notebook.card import counted_words
+from trackmdp.errors import UserError
+from trackmdp.notebook.card import counted_words, grid_words
+from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.recordings.gridding import said
@@ -252,3 +254,44 @@ def _compared(subject: str, report: dict[str, Any], simulation: Simulation | Non
         )
     title = f"{simulation.episodes} simulated ± s.e." if simulation else "simulated"
     return table(subject, ["figure", "exact", title, "Q_MDP exact"], rows)
+
+
+def evaluate_playback(
+    cfg: EvaluateConfig, chosen: PlaybackConfig, world: Problem, folder: Path, console: Console
+) -> float:
+    """Value the actions of a logged episode, on its own target and on others; returns the simulated AIHTR.
+
+    Such a policy ignores its observations, so that it has no table and no exact value.
+    """
+    with EpisodeReader(chosen.file) as reader:
+        if reader.run.size != world.size:
+            recorded = f"baseline.file={chosen.file}: recorded on {grid_words(reader.run.size)}"
+            raise UserError(f"{recorded}, expected grid.size of {grid_words(world.size)}")
+        if reader.run.kinds:
+            raise UserError(f"baseline.file={chosen.file}: of several targets, expected one")
+        logged = reader.read(chosen.episode)
+    actions = Playback(world, logged.action)
+    # The logged episode's own seed gives its own target again, so that both returns agree where nothing has changed
+    # since.
+    again = resimulate(world, actions, [logged.seed])[0]
+    simulation = simulate(world, actions, cfg.episodes, seed=cfg.seed).figures()
+    report = {
+        "policy": chosen.name,
+        "file": Path(chosen.file).name,
+        "episode": logged.number,
+        "logged_return": float(logged.returns[-1]),
+        "return": float(again.returns[-1]),
+        "simulated": asdict(simulation),
+    }
+    write_json(folder / "evaluation.json", report)
+    rows = [
+        ["logged", f"{report['logged_return']:,.4f}"],
+        ["again, on the same target", f"{report['return']:,.4f}"],
+        [
+            f"on {cfg.episodes} other targets",
+            f"{simulation.aihtr.mean:,.4f} ± {simulation.aihtr.standard_error:.4f}",
+        ],
+    ]
+    console.print(table(f"actions of episode {logged.number}", ["", "return"], rows))
+    console.print(f"results in {folder}")
+    return simulation.aihtr.mean
