@@ -8,6 +8,7 @@ import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ def check_memory(cfg: TrainConfig, task: Task, device: torch.device) -> str:
     total = sum(parts.values())
     key = max(parts, key=lambda name: parts[name])
     if total > free:
-        value = getattr(getattr(cfg, key.split(".")[0]), key.split(".")[1])
+        value = attrgetter(key)(cfg)
         raise UserError(f"{key}={value}: needs about {gib(total)}, {gib(free)} are available")
     return f"memory: about {gib(total)} of {gib(free)}, most by {key}"
 

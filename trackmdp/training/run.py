@@ -39,12 +39,11 @@ from trackmdp.training.evaluator import Evaluator, Score, fixed_policies, while_
 from trackmdp.training.folders import SUMMARY, check_files, read_summary, write_summary
 from trackmdp.training.group_run import Several, beside, learned_policy
 from trackmdp.training.inputs import problem_of, with_own_classes
-from trackmdp.training.state import load_learned
+from trackmdp.training.state import PACKAGES, load_learned
 from trackmdp.untrusted import LARGE, decoded, read_text
 from trackmdp.world.group import Subject, group_of
 
 _PROVED = ("lower", "upper", "certified", "timed_out")
-_PACKAGES = ("torch", "torchrl", "tensordict", "hydra-core", "numpy", "scipy")
 Metrics = dict[str, list[float | int | None]]
 """Columns by their names, as in `metrics.csv`: one value for each logged iteration, None for missing figures."""
 
@@ -280,7 +279,7 @@ def summarize(
         "held_out": evaluator.held_out(trainer.policy()),
         "place": place.facts() if (place := trainer.problem.task.place) else None,
         "versions": {"trackmdp": __version__, "python": platform.python_version()}
-        | {name: version(name) for name in _PACKAGES},
+        | {name: version(name) for name in PACKAGES},
         "machine": machine(),
         "config_sha256": config_digest(config, trainer.folder),
     }
