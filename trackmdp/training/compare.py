@@ -13,7 +13,7 @@ from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, counted_words, decimal, percent
 from trackmdp.policies.table import PolicyTable
 from trackmdp.recordings.tracks import Recorded
-from trackmdp.solvers.evaluate import group_rule, table_of
+from trackmdp.solvers.evaluate import group_rule, policy_table
 from trackmdp.solvers.several.group_value import evaluate_group
 from trackmdp.solvers.several.merging import Rule
 from trackmdp.solvers.value import replay, value_of
@@ -139,7 +139,7 @@ def compare(problem: Subject, policies: Mapping[str, Any] | Sequence[Any]) -> Co
         raise UserError(f"compare: {len(named)} policies, expected at least two")
     if isinstance(problem, Group):
         return _of_group(problem, _made(problem, named, partial(group_rule, problem)))
-    tables = _made(problem, named, partial(table_of, problem))
+    tables = _made(problem, named, partial(policy_table, problem))
     if problem.recorded is not None:
         return _on_tracks(problem.recorded, tables)
     found = {name: value_of(problem, table) for name, table in tables.items()}

@@ -61,9 +61,9 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem) -> float:
     if solution.interrupted:
         raise KeyboardInterrupt
     if cfg.verify:
-        from trackmdp.app.commands.verify import check  # loads the package `paper`
+        from trackmdp.app.commands.verify import verify_world  # loads the package `paper`
 
-        check(world, 1e-9, folder, console)
+        verify_world(world, 1e-9, folder, console)
     return solution.lower
 
 

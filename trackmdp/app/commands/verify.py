@@ -35,10 +35,10 @@ def run(cfg: VerifyConfig, folder: Path, world: Problem) -> None:
         )
     known = modelled(world, "verify")
     check_sensors(known)
-    check(known, cfg.tolerance, folder, console)
+    verify_world(known, cfg.tolerance, folder, console)
 
 
-def check(world: World, tolerance: float, folder: Path, console: Console) -> None:
+def verify_world(world: World, tolerance: float, folder: Path, console: Console) -> None:
     """Solve the world, with sensors of one cell, run every check, write `verification.json`, and show it.
 
     Raises:
