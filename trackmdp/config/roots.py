@@ -214,6 +214,11 @@ class FrontierConfig(WorldConfig):
         "height above an edge below which no further corner is looked for, in accuracy", gt=0, lt=1
     )
 
+    def check(self, key: str, root: Any) -> None:
+        """Whole episodes alone are solved."""
+        if self.grid.max_steps is not None:
+            raise refuse("grid.max_steps", self.grid.max_steps, "null: whole episodes are solved")
+
 
 class VerifyConfig(WorldConfig):
     """Check the paper's theorems on a world."""

@@ -117,5 +117,5 @@ def of_task(cfg: WorldConfig) -> dict[str, Any]:
     # Recorded tracks come with their place.
     place = {"place": Place.of(**cfg.grid.place)} if cfg.kernel.is_motion else {}
     # The cell, where the command has no options of memory.
-    remembered = vars(cfg.task) if hasattr(cfg, "task") else {}
-    return costs | sensors | limits | place | remembered
+    memory = {"memory": cfg.task.memory, "clip": cfg.task.clip} if hasattr(cfg, "task") else {}
+    return costs | sensors | limits | place | memory
