@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from trackmdp.config.option_fields import Option
-from trackmdp.config.options import nodes, options
+from trackmdp.config.options import Option, nodes, options
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -72,7 +72,7 @@ class _Modules(MetaPathFinder, Loader):
     def __init__(self, package: _Deferred) -> None:
         self._package = package
 
-    def find_spec(self, fullname: str, *_: Sequence[str] | ModuleType | None) -> ModuleSpec | None:
+    def find_spec(self, fullname: str, *_: Any) -> ModuleSpec | None:
         waits = fullname.startswith(f"{_NAME}.") and sys.modules[_NAME] is self._package
         return spec_from_loader(fullname, self) if waits else None
 

@@ -12,9 +12,9 @@ its own import. (Gymnasium 1.0 and later look at no entry points.)
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from importlib.machinery import ModuleSpec, PathFinder
 from types import ModuleType
+from typing import Any
 
 ID = "trackmdp/Track-v0"
 _REGISTRY = "gymnasium.envs.registration"
@@ -36,16 +36,11 @@ class _Finder:
     Not a `MetaPathFinder`: Python asks for `find_spec` alone, and `importlib.abc` loads half the standard library.
     """
 
-    def find_spec(
-        self,
-        fullname: str,
-        path: Sequence[str] | None,
-        target: ModuleType | None = None,
-    ) -> ModuleSpec | None:
+    def find_spec(self, fullname: str, *where: Any) -> ModuleSpec | None:
         if fullname != _REGISTRY:
             return None
         sys.meta_path.remove(self)
-        found = PathFinder.find_spec(fullname, path, target)
+        found = PathFinder.find_spec(fullname, *where)
         if found is not None and found.loader is not None:
             load = found.loader.exec_module
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from tests.helpers import algorithm, collect, small_world
 from trackmdp.algos.actor_loss import ActorLoss, Decision, Poisson, PolicyGradient, Surrogate
 from trackmdp.algos.hindsight_loss import HindsightLoss
-from trackmdp.config import ScheduleConfig
+from trackmdp.config.learning import ScheduleConfig
 from trackmdp.policies.policy import as_policy
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import evaluate

@@ -17,7 +17,7 @@ from trackmdp.algos.actor_loss import (
     SensorCredit,
     Surrogate,
 )
-from trackmdp.config import ScheduleConfig
+from trackmdp.config.learning import ScheduleConfig
 
 LOSSES: dict[str, Callable[[], ActorLoss]] = {
     "decision": Decision,

@@ -19,7 +19,8 @@ from tests.algos.hindsight import (
     policy,
 )
 from tests.helpers import algorithm, hop_world, small_world
-from trackmdp.config import GROUPS, PerSensorConfig
+from trackmdp.config import GROUPS
+from trackmdp.config.path_learners import PerSensorConfig
 
 PER_SENSOR = [
     name for name, schema in GROUPS["algo"].items() if issubclass(schema, PerSensorConfig)

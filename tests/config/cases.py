@@ -50,14 +50,14 @@ def files_of(command: str, choice: str) -> list[str]:
 
 
 def composed(command: str, *overrides: str) -> Any:
-    """The checked config of a command, typed in /typed/here; `evaluate` gets a baseline if it has none."""
+    """The checked config of a command; `evaluate` gets a baseline if it has none."""
     register()
     words = list(overrides)
     if command == "evaluate" and not any(word.startswith("baseline=") for word in words):
         words.insert(0, "baseline=qmdp")
     with initialize_config_dir(config_dir=conf_dir(), version_base="1.3"):
         values = composed_values(compose(command, overrides=words), ROOTS[command])
-        return config_of(values, ROOTS[command], Path("/typed/here"))
+        return config_of(values, ROOTS[command])
 
 
 def of_command(command: str) -> list[tuple[str, Option]]:

@@ -31,7 +31,7 @@ FIRST = {command: (command, choice) for command, choice in reversed(COMBINATIONS
 def test_a_config_is_that_of_the_command_line(command: str, choice: str) -> None:
     words = words_of(command, choice)
     overrides = dict(word.split("=", 1) for word in words)
-    assert compose(command, overrides, folder=Path("/typed/here")) == composed(command, *words)
+    assert compose(command, overrides) == composed(command, *words)
 
 
 def test_values_may_be_of_numpy_and_paths() -> None:
@@ -41,8 +41,12 @@ def test_values_may_be_of_numpy_and_paths() -> None:
         "kernel": "table",
         "kernel.path": Path("k.npy"),
     }
-    cfg = compose("train", given, folder=Path("/typed"))
-    assert (cfg.grid.size, cfg.cost.sensor, cfg.kernel.path) == (3, [0.5] * 9, "/typed/k.npy")
+    cfg = compose("train", given)
+    assert (cfg.grid.size, cfg.cost.sensor, cfg.kernel.path) == (
+        3,
+        [0.5] * 9,
+        f"{Path.cwd()}/k.npy",
+    )
     assert (type(cfg.grid.size), cfg.algo.total_frames) == (int, 300_000)
 
 

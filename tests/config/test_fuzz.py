@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,7 @@ def bad_values(item: Option) -> list[str]:
         beyond = [
             limit + by * (1 if item.kind is int else max(1e-6, 1e-6 * abs(limit)))
             for limit, by in limits
-            if limit is not None
+            if abs(limit) < math.inf
         ]
         bad += [str(item.kind(value)) for value in beyond]
     if item.kind is int:

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 
 import trackmdp as tm
 from tests.helpers import configured
-from trackmdp.config import load_config, to_yaml
+from trackmdp.config import to_yaml
 from trackmdp.config.compose import compose
 from trackmdp.config.roots import SolveConfig
+from trackmdp.config.tree import load_config
 from trackmdp.errors import UserError
 from trackmdp.motion.modes import (
     constant_velocity,
@@ -180,8 +181,9 @@ def test_regimes_by_hand() -> None:
     )
 
 
-def test_regimes_are_data(tmp_path: Path) -> None:
+def test_regimes_are_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Left out options are those of conf/; a table's path becomes absolute; the saved config says all of it."""
+    monkeypatch.chdir(tmp_path)
     np.save(tmp_path / "t.npy", np.full((9, 9), 0.1))
 
     listed = [
@@ -189,9 +191,7 @@ def test_regimes_are_data(tmp_path: Path) -> None:
         "t.npy",
         {"kernel": "table", "path": Path("t.npy")},
     ]
-    made = compose(
-        "solve", {"kernel": "regimes", "kernel.regimes": listed, "grid.size": 3}, folder=tmp_path
-    )
+    made = compose("solve", {"kernel": "regimes", "kernel.regimes": listed, "grid.size": 3})
     drift, table, same = made.kernel.regimes
     assert drift == {
         "kernel": "drift",
@@ -225,11 +225,11 @@ def test_regimes_are_data(tmp_path: Path) -> None:
         ),
         (
             "kernel.regimes=[{kernel: drift}, {kernel: drift, way: 3}]",
-            r"kernel\.regimes\[1\]\.way: unknown option.*\(known: .*kernel\.regimes\[1\]\.direction",
+            r"kernel\.regimes\[1\]\.way: unknown key.*\(known: .*direction",
         ),
         (
             "kernel.regimes=[{kernel: drift}, {kernel: drift, direction: 400}]",
-            r"kernel\.regimes\[1\]\.direction=400: expected a number >= 0 and < 360 \(degrees\)",
+            r"kernel\.regimes\[1\]\.direction=400\.0: expected a number >= 0 and < 360 \(degrees\)",
         ),
         (
             "kernel.regimes=[{kernel: drift}, {kernel: table}]",

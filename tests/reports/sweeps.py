@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from tests.helpers import train_config
-from trackmdp.config import PaperCostConfig, TrainConfig
+from trackmdp.config import TrainConfig
+from trackmdp.config.sensors import PaperCostConfig
 from trackmdp.config.tree import config_digest, config_text
 from trackmdp.durable import write_json
 from trackmdp.policies.policy import Policy

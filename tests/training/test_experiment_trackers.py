@@ -16,7 +16,7 @@ from trackmdp.config import MlflowConfig, load_run_config, to_dict
 from trackmdp.errors import UserError, adding
 from trackmdp.policies.policy import Policy
 from trackmdp.training.callbacks import Training
-from trackmdp.training.experiment_trackers import MlflowLogger
+from trackmdp.training.result_loggers import MlflowLogger
 from trackmdp.training.run import load_run
 from trackmdp.training.train import train as train_in_python
 from trackmdp.world.make import make_world

@@ -16,7 +16,7 @@ import torch
 from tests.helpers import algorithm, collect, small_world, train_config
 from trackmdp.algos.dqn import DQN
 from trackmdp.app.cli import main
-from trackmdp.config import DqnConfig
+from trackmdp.config.learning import DqnConfig
 from trackmdp.errors import UserError
 from trackmdp.machine import free_bytes
 from trackmdp.training.devices import check_memory, needs

@@ -36,10 +36,9 @@ from trackmdp.app.prepare import (
 )
 from trackmdp.app.words import gathered, parsed, run_words
 from trackmdp.config import GROUPS, ROOTS
-from trackmdp.config.checks import validate
+from trackmdp.config.checks import build_config, validate
 from trackmdp.config.registry import maker
-from trackmdp.config.resume import key_of
-from trackmdp.config.tree import build_config
+from trackmdp.config.tree import key_of
 from trackmdp.errors import UserError, message_of
 from trackmdp.signals import handled, leave
 
@@ -127,7 +126,7 @@ def _run_in_hydra(cfg: DictConfig, ready: Prepared) -> None:
 
 
 def _sweep(compose: Composer) -> int:
-    from trackmdp.app.sweep.plan import Job, plan
+    from trackmdp.app.sweep.plan import plan
     from trackmdp.app.sweep.sweep import sweep
     from trackmdp.training.display import make_console
 
@@ -140,17 +139,16 @@ def _sweep(compose: Composer) -> int:
     # Absolute: runs start in processes, perhaps on other machines, with another current folder.
     place = folder.absolute()
 
-    def launch_jobs(jobs: Sequence[Job]) -> None:
-        maker(launcher)(launcher, [replace(job, concurrent=launcher.concurrent) for job in jobs])
-
     console = make_console(cfg.quiet)
-    planned = partial(plan, command, place, compose, console=console)
+    planned = partial(
+        plan, command, place, compose, console=console, concurrent=launcher.concurrent
+    )
     batches = maker(sweeper)(sweeper, run_words(compose.words), place, planned)
     line = shlex.join(["trackmdp", command, "-m", *compose.words])
     made = make_folder("hydra.sweep.dir", folder)
     try:
         # A grid has been composed and checked to the last run by now; a search plans its runs as it goes.
-        return sweep(place, command, line, batches, launch_jobs, console)
+        return sweep(place, command, line, batches, partial(maker(launcher), launcher), console)
     finally:
         # A search lets go of its study, which it no longer can at Python's end.
         if isinstance(batches, Generator):

@@ -19,7 +19,7 @@ from trackmdp.config.checks import refuse_ignored
 from trackmdp.config.compose import composed_values, config_of
 from trackmdp.config.learning import file_of_classes
 from trackmdp.config.logs import require_packages
-from trackmdp.config.resume import by_key, continued, key_of, run_folder
+from trackmdp.config.tree import by_key, continued, key_of, run_folder
 from trackmdp.errors import UserError, message_of
 from trackmdp.imports import importing
 
@@ -67,7 +67,7 @@ def prepare(command: str, composed: DictConfig, words: Sequence[str]) -> Prepare
     values = composed_values(composed, schema)
     resumes = values.get("resume") is not None
     # Those of a run that goes on are for its own options, which the defaults here are not.
-    cfg = config_of(values, schema, Path.cwd(), rules=not resumes)
+    cfg = config_of(values, schema, rules=not resumes)
     if not resumes:
         refuse_ignored(cfg, by_key(words))
     prepared = check(command, cfg, folder_of(composed, "hydra.run.dir"), words)

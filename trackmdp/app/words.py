@@ -15,8 +15,7 @@ from omegaconf import DictConfig
 from trackmdp.config import GROUPS, ROOTS, CommandConfig, Option, options
 from trackmdp.config.checks import check_choice, check_option
 from trackmdp.config.compose import composed_values, known_options
-from trackmdp.config.option_fields import refuse
-from trackmdp.config.options import several
+from trackmdp.config.options import refuse, several
 from trackmdp.errors import UserError
 
 MOST = 100_000

@@ -4,18 +4,24 @@ Here stand the names that commands and plugins use most; each schema is in a mod
 """
 
 from trackmdp.config.baselines import BaselineConfig, PlaybackConfig
-from trackmdp.config.credit import PerSensorConfig
-from trackmdp.config.learning import AlgoConfig, CollectorConfig, DqnConfig, ScheduleConfig
+from trackmdp.config.learning import AlgoConfig, CollectorConfig
 from trackmdp.config.logs import (
     CsvConfig,
     LogConfig,
     McapConfig,
     MlflowConfig,
-    TensorboardConfig,
     WandbConfig,
 )
-from trackmdp.config.option_fields import Option, option, refuse
-from trackmdp.config.options import GROUPS, ChoiceConfig, Node, NodeConfig, Sizes, choice, options
+from trackmdp.config.options import (
+    GROUPS,
+    ChoiceConfig,
+    NodeConfig,
+    Option,
+    choice,
+    option,
+    options,
+    refuse,
+)
 from trackmdp.config.registry import conf_dir, load_plugins
 from trackmdp.config.roots import (
     ROOTS,
@@ -32,14 +38,13 @@ from trackmdp.config.roots import (
     VerifyConfig,
     WorldConfig,
 )
-from trackmdp.config.sensors import CostConfig, FalseAlarmConfig, PaperCostConfig, SensorConfig
+from trackmdp.config.sensors import CostConfig, FalseAlarmConfig, SensorConfig
 from trackmdp.config.tree import (
-    load_config,
     load_run_config,
     to_dict,
     to_yaml,
     train_config_of,
 )
-from trackmdp.config.world import MEMORIES, KernelConfig, TableConfig
+from trackmdp.config.world import MEMORIES, KernelConfig
 
 load_plugins()  # at the end: they import the names above

@@ -5,10 +5,19 @@ The group `baseline` (evaluate) has all of them, the group `solver` (solve) the 
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
-from trackmdp.config.option_fields import count_option, file_option, option, refuse, share_option
-from trackmdp.config.options import GROUPS, ChoiceConfig, choice, listed
+from trackmdp.config.options import (
+    GROUPS,
+    ChoiceConfig,
+    choice,
+    count_option,
+    file_option,
+    listed,
+    option,
+    refuse,
+    share_option,
+)
 from trackmdp.machine import SIZE_PATTERN
 
 
@@ -24,10 +33,10 @@ class BaselineConfig(ChoiceConfig):
         whole_episodes: plans for episodes that only the exit ends; `grid.max_steps` then counts in the valuing alone.
     """
 
-    without_motion: ClassVar[bool] = False
-    whole_episodes: ClassVar[bool] = False
-    knows_footprints: ClassVar[bool] = True
-    knows_budget: ClassVar[bool] = True
+    without_motion = False
+    whole_episodes = False
+    knows_footprints = True
+    knows_budget = True
 
 
 @choice("baseline", "qmdp", makes="trackmdp.solvers.rules:qmdp")

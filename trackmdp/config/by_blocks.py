@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from trackmdp.cluster import ADDRESS
-from trackmdp.config.option_fields import count_option, option, refuse
-from trackmdp.config.options import NodeConfig, listed
+from trackmdp.config.options import NodeConfig, count_option, listed, option, refuse
 
 
 class PartitionConfig(NodeConfig):

@@ -1,6 +1,6 @@
 """Checks before anything is built: names, ranges, rules between options, and options without effect.
 
-A refusal is one line, the same from Python and at the terminal.
+A refusal is one line, the same from Python and at the terminal. `build_config` makes the dataclasses of plain values.
 """
 
 from __future__ import annotations
@@ -14,8 +14,17 @@ from typing import Any, TypeVar
 
 from omegaconf import MISSING
 
-from trackmdp.config.option_fields import Option, is_number, refuse
-from trackmdp.config.options import GROUPS, leaves, nodes, options
+from trackmdp.config.options import (
+    GROUPS,
+    Node,
+    Option,
+    as_float,
+    is_number,
+    leaves,
+    nodes,
+    options,
+    refuse,
+)
 from trackmdp.errors import UserError
 
 _T = TypeVar("_T")
@@ -130,6 +139,55 @@ def validate(cfg: _T, place: str = "", root: Any = None, *, rules: bool = True) 
     for key, node in nodes(cfg, place) if rules else ():
         node.check(key, root or cfg)
     return cfg
+
+
+def build_config(plain: Any, schema: type[_T], prefix: str = "") -> _T:
+    """The dataclasses of a plain config; values are not checked.
+
+    Args:
+        plain: the config, or a part of it.
+        schema: its dataclass.
+        prefix: of a part, stands before its keys in messages, such as ``algo.``.
+
+    Raises:
+        UserError: a key is missing or unknown, or a choice is.
+    """
+    if not isinstance(plain, Mapping):
+        raise UserError(f"{prefix.rstrip('.')}={plain}: expected a mapping")
+    known = options(schema)
+    # Unknown keys first: a misspelt key is missing as well, and this message has the right one.
+    for key in plain:
+        if key not in known:
+            raise UserError(f"{prefix}{key}: unknown key{suggestion(str(key), known)}")
+    for key in known:
+        if key not in plain:
+            raise UserError(f"{prefix}{key}: missing")
+    return schema(**{key: _built(key, item, plain[key], prefix) for key, item in known.items()})
+
+
+def _built(key: str, item: Option | Node, value: Any, prefix: str) -> Any:
+    """The value of one key, or the dataclasses of a part."""
+    if isinstance(item, Option):
+        # `reward: 10` in a file is an integer to YAML; `type` leaves True, which is refused by its own check.
+        return as_float(value) if item.kind is float and type(value) is int else value
+    if value is None and item.optional:
+        return None
+    if value == MISSING:
+        needed = f"{key}=NAME" if key in GROUPS else f"its {', '.join(options(item.schema))}"
+        raise UserError(f"{prefix}{key}: missing, expected {needed}")
+    if item.several and isinstance(value, Mapping):
+        for name in value:
+            check_choice(key, name)
+        return {
+            name: build_config(own, GROUPS[key][name], f"{prefix}{key}.{name}.")
+            for name, own in value.items()
+        }
+    schema = item.schema
+    if key in GROUPS and isinstance(value, Mapping):
+        check_choice(key, value.get("name"))
+        schema = GROUPS[key][value["name"]]
+        value = {own: each for own, each in value.items() if own != "name"}
+    return build_config(value, schema, f"{prefix}{key}.")
 
 
 def refuse_ignored(cfg: Any, typed: Mapping[str, Any]) -> None:

@@ -10,34 +10,30 @@ import os
 from collections.abc import Iterator, Mapping
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
 from trackmdp.config.checks import (
     absolute_paths,
+    build_config,
     check_choice,
     check_option,
     refuse_ignored,
     validate,
 )
-from trackmdp.config.option_fields import Option
-from trackmdp.config.options import GROUPS, Node, leaves, options
+from trackmdp.config.options import GROUPS, Node, Option, leaves, options
 from trackmdp.config.registry import choice_values, read_values, resolved
 from trackmdp.config.roots import ROOTS
-from trackmdp.config.tree import build_config
 from trackmdp.errors import UserError
 
 
-def compose(
-    command: str, overrides: Mapping[str, Any] | None = None, *, folder: Path | None = None
-) -> Any:
+def compose(command: str, overrides: Mapping[str, Any] | None = None) -> Any:
     """The checked config of a command with some choices and options replaced.
 
     Args:
         command: the defaults are those of `conf/<command>.yaml`.
         overrides: choices (``{"algo": "ppo"}``) and options by their dotted names (``{"algo.epochs": 3}``).
-        folder: of relative paths; by default the current folder.
 
     Raises:
         UserError: a name, a type or a range is wrong, or a rule between options is broken.
@@ -54,7 +50,7 @@ def compose(
             for parent in parents:
                 node = node[parent]
             node[last] = value
-    cfg = config_of(values, schema, folder or Path.cwd())
+    cfg = config_of(values, schema)
     refuse_ignored(cfg, typed)
     return cfg
 
@@ -114,22 +110,19 @@ def composed_values(cfg: DictConfig, schema: type[Any]) -> dict[str, Any]:
     return dict(values)
 
 
-def config_of(
-    values: dict[str, Any] | DictConfig, schema: type[Any], folder: Path, *, rules: bool = True
-) -> Any:
-    """The dataclasses of the values, resolved and checked.
+def config_of(values: dict[str, Any] | DictConfig, schema: type[Any], *, rules: bool = True) -> Any:
+    """The dataclasses of the values, resolved and checked; relative paths are meant from the current folder.
 
     Args:
         values: of `composed_values`, or of the files.
         schema: of the command.
-        folder: of relative paths.
         rules: whether those between options are checked.
 
     Raises:
         UserError: an unknown key (also one added with `+`), a missing value, a wrong type, or a broken rule.
     """
     cfg = validate(build_config(resolved(values), schema), rules=rules)
-    absolute_paths(cfg, folder)
+    absolute_paths(cfg, Path.cwd())
     return cfg
 
 
@@ -158,16 +151,16 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
-class Default:
+class Default(NamedTuple):
     """A default in a signature that is stated in `conf/`; `help` shows its value.
 
-    Args:
+    Attributes:
         key: the option, by its dotted name.
         command: of the config.
     """
 
-    def __init__(self, key: str, command: str = "train") -> None:
-        self.key, self.command = key, command
+    key: str
+    command: str = "train"
 
     @property
     def value(self) -> Any:
@@ -179,9 +172,8 @@ class Default:
         return repr(self.value)
 
 
-def default(key: str, command: str = "train") -> Any:
-    """A `Default`; to a type checker it has the type of its parameter."""
-    return Default(key, command)
+default: Any = Default
+"""Makes a `Default`; to a type checker it has the type of its parameter."""
 
 
 def given(arguments: Mapping[str, Any]) -> dict[str, Any]:

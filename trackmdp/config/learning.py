@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 from trackmdp.cluster import ADDRESS
-from trackmdp.config.option_fields import count_option, option, refuse, share_option
-from trackmdp.config.options import BYTES, ChoiceConfig, NodeConfig, Sizes, choice, nested
+from trackmdp.config.options import (
+    BYTES,
+    ChoiceConfig,
+    NodeConfig,
+    choice,
+    count_option,
+    nested,
+    option,
+    refuse,
+    share_option,
+)
 
 MOST_FRAMES = 10**12
 """Most frames of a run: eleven days at a million frames per second. A larger number is a slip."""
@@ -55,13 +64,13 @@ class AlgoConfig(ChoiceConfig):
     The code of a choice is called as ``Learner(task, cfg, iterations=..., seed=..., device=...)``.
     """
 
-    remembers: ClassVar[bool] = False
+    remembers = False
     """Whether it learns policies that remember more than the cell: `task.memory`, modes, `kernel.reveals`."""
-    knows_footprints: ClassVar[bool] = False
+    knows_footprints = False
     """Whether sensors may cover several cells."""
-    knows_budget: ClassVar[bool] = False
+    knows_budget = False
     """Whether no more sensors than the budget are on, also while learning."""
-    joint: ClassVar[bool] = False
+    joint = False
     """Whether it learns of several targets together; else of a single one, and plans are merged."""
     total_frames: int = count_option("env steps the algorithm needs", unit="frames", le=MOST_FRAMES)
     frames_per_batch: int = count_option("env steps per collected batch", unit="frames")
@@ -86,17 +95,14 @@ class NetworkConfig(EveryTaskConfig):
     hidden: int = count_option("units of the hidden layer of each network", unit="units", le=4096)
     reward_scale: float = option("factor on rewards while learning", gt=0)
 
-    def needs(self, task: Sizes, root: Any) -> dict[str, int]:
+    def needs(self, task: Any, root: Any) -> dict[str, int]:
         """Two networks and their optimiser; their hidden units for each target of a batch."""
         found, targets = {"algo.hidden": networks(task, self.hidden)}, together(root)
         if targets > 1:
-            rows = targets * self.learned_at_once(root)
+            # Frames that go through the networks together.
+            rows = targets * getattr(self, "batch_size", root.collector.frames_per_batch)
             found["targets.count"] = _PASSES * rows * self.hidden * BYTES["float32"]
         return found
-
-    def learned_at_once(self, root: Any) -> int:
-        """Frames that go through the networks together."""
-        return int(root.collector.frames_per_batch)
 
 
 class ActorCriticConfig(NetworkConfig):
@@ -168,20 +174,16 @@ class DqnConfig(NetworkConfig):
             expected = f"at least collector.frames_per_batch={frames} and {key}.batch_size={self.batch_size}"
             raise refuse(f"{key}.buffer_size", self.buffer_size, expected)
 
-    def needs(self, task: Sizes, root: Any) -> dict[str, int]:
+    def needs(self, task: Any, root: Any) -> dict[str, int]:
         """The replay buffer with two states a transition; the networks."""
         # State and next state, the action's K bits as bools, two float32 and one flag (reward, discount,
         # terminated), an index.
-        states = 2 * state_bytes(task, together(root))
+        states = 2 * state_bytes(task, root)
         transition = states + task.num_sensors + 2 * BYTES["float32"] + 1 + BYTES["int64"]
         priority = BYTES["float64"] if self.prioritized.enabled else 0
         return super().needs(task, root) | {
             "algo.buffer_size": self.buffer_size * (transition + priority)
         }
-
-    def learned_at_once(self, root: Any) -> int:
-        """Frames that go through the networks together."""
-        return self.batch_size
 
 
 class CollectorConfig(ChoiceConfig):
@@ -196,11 +198,6 @@ class CollectorConfig(ChoiceConfig):
         "device the environments live on", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE
     )
 
-    @property
-    def stepped(self) -> int:
-        """Environments stepped together, in all workers."""
-        return self.envs
-
     def check(self, key: str, root: Any) -> None:
         """A batch is a whole number of steps of all environments, and a run at least one batch."""
         # Where the collector has the value of the algorithm, the algorithm's option is the one to change.
@@ -210,18 +207,19 @@ class CollectorConfig(ChoiceConfig):
         )
         # A batch is `[B, time]`, B environments for equally many steps: TorchRL would round it up, and the
         # frames collected would not be those of the config.
-        if self.frames_per_batch % self.stepped:
-            factors = f"{key}.envs" + (f" x {key}.workers" if self.stepped > self.envs else "")
-            expected = f"a multiple of {self.stepped} ({factors})"
+        stepped = self.envs * getattr(self, "workers", 1)
+        if self.frames_per_batch % stepped:
+            factors = f"{key}.envs" + (f" x {key}.workers" if stepped > self.envs else "")
+            expected = f"a multiple of {stepped} ({factors})"
             raise refuse(batch, self.frames_per_batch, expected)
         if self.total_frames < self.frames_per_batch:
             expected = f"at least {batch}={self.frames_per_batch}"
             raise refuse(frames, self.total_frames, expected)
 
-    def needs(self, task: Sizes, root: Any) -> dict[str, int]:
+    def needs(self, task: Any, root: Any) -> dict[str, int]:
         """Two batches: one is collected while the other is handed over."""
         number = BYTES["float32"]
-        state = state_bytes(task, together(root))
+        state = state_bytes(task, root)
         frame = 2 * (state + 3) + task.num_sensors + number * (task.num_sensors + 2)
         return {"collector.frames_per_batch": 2 * self.frames_per_batch * frame}
 
@@ -236,11 +234,6 @@ class WorkersConfig(CollectorConfig):
 
     workers: int = count_option("worker processes", le=256)
     threads: int = count_option("torch threads of each worker process", unit="threads", le=256)
-
-    @property
-    def stepped(self) -> int:
-        """Environments stepped together, in all workers."""
-        return self.envs * self.workers
 
 
 @choice("collector", "multi_sync", makes="trackmdp.training.collect:multi_sync")
@@ -281,21 +274,22 @@ def together(root: Any) -> int:
     return int(root.targets.count) if root.algo.joint else 1
 
 
-def state_bytes(task: Sizes, targets: int = 1) -> int:
+def state_bytes(task: Any, root: Any) -> int:
     """Bytes of one observation: located cell, misses, the key where there is one, the actions since the detection.
 
     Of several targets cell and misses are those of each, and whether it is in the grid is observed too.
     """
+    targets = together(root)
     each = (2 + task.keyed) * BYTES["int64"] + (targets > 1)
     return targets * each + task.num_choices * task.num_sensors
 
 
-def renewed_table(task: Sizes) -> int:
+def renewed_table(task: Any) -> int:
     """Bytes of the table by which a policy that is renewed while learning acts: a bit for each key, n and sensor."""
     return task.num_keys * task.num_choices * -(-task.num_sensors // 8)
 
 
-def networks(task: Sizes, hidden: int | None) -> int:
+def networks(task: Any, hidden: int | None) -> int:
     """Bytes of two networks of one hidden layer (256 units where `hidden` is left open), with Adam's two moments."""
     # located cell, n and both at once by number; the history by sensor, as are the outputs
     inputs = task.num_cells * (task.num_choices + 3) + task.num_choices * (task.num_sensors + 1) + 1

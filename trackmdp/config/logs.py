@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from trackmdp.config.option_fields import count_option, option
-from trackmdp.config.options import ChoiceConfig, choice
+from trackmdp.config.options import ChoiceConfig, choice, count_option, option
 from trackmdp.errors import require
 
 
@@ -16,7 +15,7 @@ class LogConfig(ChoiceConfig):
     The code of a choice gets its config and the folder of the run, and returns a callback of the training.
     """
 
-    episodes_only: ClassVar[bool] = False
+    episodes_only = False
     package: ClassVar[str | None] = None
     """A package beyond the dependencies of trackmdp; the extra with the name of the choice adds it."""
 
@@ -27,7 +26,7 @@ class RowsConfig(LogConfig):
     every: int = count_option("iterations from one row to the next", unit="iterations")
 
 
-@choice("log", "csv", makes="trackmdp.training.loggers:CsvLogger")
+@choice("log", "csv", makes="trackmdp.training.callbacks:CsvLogger")
 class CsvConfig(RowsConfig):
     """`metrics.csv`, which a training always writes: without this choice a row for every iteration."""
 
@@ -39,7 +38,7 @@ class TensorboardConfig(RowsConfig):
     package = "tensorboard"
 
 
-@choice("log", "wandb", makes="trackmdp.training.experiment_trackers:WandbLogger")
+@choice("log", "wandb", makes="trackmdp.training.result_loggers:WandbLogger")
 class WandbConfig(RowsConfig):
     """Weights & Biases. `wandb sync` uploads an offline log, in the folder of the run."""
 
@@ -50,7 +49,7 @@ class WandbConfig(RowsConfig):
     project: str = option("project of the run", expects="a name", pattern=r"[\w .-]{1,128}")
 
 
-@choice("log", "mlflow", makes="trackmdp.training.experiment_trackers:MlflowLogger")
+@choice("log", "mlflow", makes="trackmdp.training.result_loggers:MlflowLogger")
 class MlflowConfig(RowsConfig):
     """MLflow, in a database or on a server."""
 

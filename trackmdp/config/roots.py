@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
-from trackmdp.config import counting, credit, given, hidden_kernels, sweeping  # noqa: F401  (more to choose from)
+from trackmdp.config import hidden_kernels, path_learners, sweeping  # noqa: F401  (more to choose from)
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.by_blocks import PartitionConfig, SweptPartitionConfig
 from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig
 from trackmdp.config.logs import LogConfig
-from trackmdp.config.option_fields import count_option, file_option, option, refuse, share_option
-from trackmdp.config.options import GROUPS, NodeConfig, listed, options
+from trackmdp.config.options import (
+    GROUPS,
+    NodeConfig,
+    count_option,
+    file_option,
+    listed,
+    option,
+    options,
+    refuse,
+    share_option,
+)
 from trackmdp.config.sensors import CostConfig, SensorConfig
 from trackmdp.config.several import MergedTargetsConfig, TargetsConfig, WidthConfig
 from trackmdp.config.world import GridConfig, KernelConfig, TaskConfig
@@ -20,28 +29,22 @@ from trackmdp.errors import UserError
 class CommandConfig(NodeConfig):
     """Common options of all commands."""
 
-    learns: ClassVar[bool] = False
+    learns = False
     quiet: bool = option("print nothing but errors")
 
 
 class WorldConfig(CommandConfig):
     """Common options of the commands in a world."""
 
-    needs_motion: ClassVar[bool] = True
-    all_prices: ClassVar[bool] = False
+    needs_motion = True
+    all_prices = False
     """Whether the command sets the prices of sensors itself; those given are then ratios."""
-    any_number: ClassVar[bool] = False
+    any_number = False
     """Whether the command is about policies with any number of sensors on."""
     grid: GridConfig
     kernel: KernelConfig
     cost: CostConfig
     sensor: SensorConfig
-
-    @property
-    def remembered(self) -> dict[str, Any]:
-        """Memory of policies, as arguments of `Task`; the cell, where the command has no options of it."""
-        task: TaskConfig | None = getattr(self, "task", None)
-        return {} if task is None else {"memory": task.memory, "clip": task.clip}
 
 
 class EvaluationConfig(WidthConfig):

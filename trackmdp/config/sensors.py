@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import re
-from typing import Any, ClassVar
+from typing import Any
 
-from trackmdp.config.option_fields import TABLE, Option, count_option, file_option, option, refuse
-from trackmdp.config.options import ChoiceConfig, choice, listed, require_able
+from trackmdp.config.options import (
+    TABLE,
+    ChoiceConfig,
+    Option,
+    choice,
+    count_option,
+    file_option,
+    listed,
+    option,
+    refuse,
+    require_able,
+)
 from trackmdp.config.world import GridConfig
 from trackmdp.errors import UserError
 
@@ -53,10 +63,25 @@ class PaperCostConfig(CostConfig):
 
     def check(self, key: str, root: Any) -> None:
         """One price for all sensors, or one for each; a file is read later."""
+        partition = getattr(root, "partition", None)
+        # Blocks settle what they share by trees, which decide on one cell at a time.
+        by_blocks = partition is not None and partition.block is not None
         if self.budget is not None:
-            _check_budget(f"{key}.budget", self.budget, root)
+            if root.sensor.covers:
+                raise refuse(f"{key}.budget", self.budget, f"null with sensor={root.sensor.name}")
+            require_able(root, "knows_budget", f"with {key}.budget={self.budget}")
+            if root.any_number or by_blocks:
+                expected = "null here, where any number of sensors is on"
+                raise refuse(f"{key}.budget", self.budget, expected)
         if self.mean_budget is not None:
-            _check_mean(f"{key}.mean_budget", self, root)
+            # The price is the multiplier of the budget: the edge of the frontier has one only where all are alike.
+            solver = getattr(root, "solver", None)
+            if partition is None or by_blocks or solver is None or solver.name != "optimal":
+                expected = "null but for solve with solver=optimal in one block"
+                raise refuse(f"{key}.mean_budget", self.mean_budget, expected)
+            if self.budget is not None or not isinstance(self.sensor, (int, float)):
+                expected = "one price for all sensors beside it, and no cost.budget"
+                raise refuse(f"{key}.mean_budget", self.mean_budget, expected)
         price = Option("", ge=0, le=LARGEST_PRICE, kind=float)
         count, each = root.sensor.count(root.grid), "sensor" if root.sensor.covers else "cell"
         _check_per_cell(
@@ -71,45 +96,13 @@ class PaperCostConfig(CostConfig):
         return {}
 
 
-def _check_budget(key: str, budget: int, root: Any) -> None:
-    """Refuse what does not keep to a budget.
-
-    Raises:
-        UserError: sensors have footprints, or a planner, a learner or a proof is for any number of sensors.
-    """
-    if root.sensor.covers:
-        raise refuse(key, budget, f"null with sensor={root.sensor.name}")
-    require_able(root, "knows_budget", f"with {key}={budget}")
-    # Blocks settle what they share by trees, which decide on one cell at a time.
-    partition = getattr(root, "partition", None)
-    if root.any_number or (partition is not None and partition.block is not None):
-        raise refuse(key, budget, "null here, where any number of sensors is on")
-
-
-def _check_mean(key: str, cost: PaperCostConfig, root: Any) -> None:
-    """Refuse a mean budget beside what it does not go with.
-
-    Raises:
-        UserError: another command than solve, another solver than optimal, prices that differ, or a second budget.
-    """
-    partition = getattr(root, "partition", None)
-    # The price is the multiplier of the budget: the edge of the frontier has one only where all prices are alike.
-    at_once = partition is not None and partition.block is None
-    if not (at_once and getattr(getattr(root, "solver", None), "name", "") == "optimal"):
-        raise refuse(key, cost.mean_budget, "null but for solve with solver=optimal in one block")
-    if cost.budget is not None or not isinstance(cost.sensor, (int, float)):
-        raise refuse(
-            key, cost.mean_budget, "one price for all sensors beside it, and no cost.budget"
-        )
-
-
 class SensorConfig(ChoiceConfig):
     """Base of the group `sensor`: detections of a sensor that is on.
 
     The code of a choice gets the size of the grid and the options of the choice, and returns arguments of `Task`.
     """
 
-    covers: ClassVar[bool] = False
+    covers = False
     """Whether a sensor covers a set of cells, so that there need not be one in each cell."""
 
     def count(self, grid: GridConfig) -> int | None:
@@ -151,8 +144,8 @@ class MissConfig(SensorConfig):
 
     def check(self, key: str, root: Any) -> None:
         """One probability for all cells, or one for each; a file is read later."""
-        _check_chance(f"{key}.p_d", self.p_d, root.grid)
-        _check_chance(f"{key}.p_s", self.p_s, root.grid)
+        _check_chance(f"{key}.p_d", self.p_d, root)
+        _check_chance(f"{key}.p_s", self.p_s, root)
 
 
 @choice("sensor", "false_alarm", makes="trackmdp.sensing.makers:false_alarm")
@@ -180,7 +173,7 @@ class FalseAlarmConfig(SensorConfig):
             raise refuse(
                 "log", listed(root.log), f"[] with {key}={self.name}, where nothing is simulated"
             )
-        _check_chance(f"{key}.p_d", self.p_d, root.grid)
+        _check_chance(f"{key}.p_d", self.p_d, root)
 
 
 @choice("sensor", "footprint", makes="trackmdp.sensing.makers:footprint")
@@ -224,9 +217,9 @@ def lattice(side: int, spacing: int) -> range:
     return range((side - 1) % spacing // 2, side, spacing)
 
 
-def _check_chance(key: str, value: Any, grid: GridConfig) -> None:
+def _check_chance(key: str, value: Any, root: Any) -> None:
     number = Option("", gt=0, le=1, kind=float)
-    _check_per_cell(key, value, grid.num_cells, number, "number above 0, at most 1")
+    _check_per_cell(key, value, root.grid.num_cells, number, "number above 0, at most 1")
 
 
 def _check_per_cell(

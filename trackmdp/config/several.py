@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from trackmdp.config.option_fields import count_option, option, refuse
-from trackmdp.config.options import NodeConfig
+from trackmdp.config.options import NodeConfig, count_option, option, refuse
 
 MOST_TARGETS = 1_000
 """Targets in one grid: of more, each step and each bound would take minutes."""

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 from trackmdp.cluster import ADDRESS, joining
-from trackmdp.config.option_fields import count_option, option
-from trackmdp.config.options import ChoiceConfig, choice
+from trackmdp.config.options import ChoiceConfig, choice, count_option, option
 from trackmdp.errors import UserError, require
 
 PLUGINS = ("launcher", "sweeper")
@@ -16,9 +15,9 @@ PLUGINS = ("launcher", "sweeper")
 class PluginConfig(ChoiceConfig):
     """Base of both groups."""
 
-    package: ClassVar[str] = ""
+    package = ""
     """Imported package; `extra` is the extra of this package that adds it."""
-    extra: ClassVar[str] = ""
+    extra = ""
 
     def check(self, key: str, root: Any) -> None:
         """The package is installed."""
@@ -73,7 +72,7 @@ class LauncherConfig(PluginConfig):
     The code of a choice gets its config and jobs, and returns once none of them is running.
     """
 
-    concurrent: ClassVar[bool] = True
+    concurrent = True
 
 
 @choice("hydra/launcher", "basic", makes="trackmdp.app.sweep.launchers:run_basic")

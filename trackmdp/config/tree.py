@@ -1,18 +1,17 @@
-"""From typed dataclasses to a plain `config.yaml` and back."""
+"""A typed config as a plain `config.yaml` and back, and the config of a run that is resumed."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from omegaconf import MISSING, OmegaConf
+from omegaconf import OmegaConf
 
-from trackmdp.config.checks import absolute_paths, check_choice, own_paths, suggestion, validate
-from trackmdp.config.option_fields import Option, as_float
-from trackmdp.config.options import GROUPS, Node, options
+from trackmdp.config.checks import absolute_paths, build_config, own_paths, validate
+from trackmdp.config.options import Option, listed, options, several
 from trackmdp.config.roots import CommandConfig, TrainConfig
 from trackmdp.errors import UserError
 from trackmdp.untrusted import parse_yaml, read_text
@@ -102,50 +101,125 @@ def load_run_config(folder: str | Path) -> TrainConfig:
     return config
 
 
-def build_config(plain: Any, schema: type[_T], prefix: str = "") -> _T:
-    """The dataclasses of a plain config; values are not checked.
+CHANGEABLE = (
+    "collector.total_frames",
+    "optimal",
+    "evaluation",
+    "log",
+    "checkpoint",
+    "partition.workers",
+    "partition.cluster",
+    "device",
+    "collector.device",
+    "quiet",
+)
+"""Options, or groups of them, that may differ on resume: budget, solving, logging, saving, workers, and devices of the
+same kind."""
 
-    Args:
-        plain: the config, or a part of it.
-        schema: its dataclass.
-        prefix: of a part, stands before its keys in messages, such as ``algo.``.
+
+def run_folder(cfg: TrainConfig, chosen: Path, key: str = "hydra.run.dir") -> Path:
+    """The folder of the run: of the one that it resumes, else `chosen`, which the option `key` names.
 
     Raises:
-        UserError: a key is missing or unknown, or a choice is.
+        UserError: `resume` names no run, or `chosen` holds a run and `resume` is null.
     """
-    if not isinstance(plain, Mapping):
-        raise UserError(f"{prefix.rstrip('.')}={plain}: expected a mapping")
-    known = options(schema)
-    # Unknown keys first: a misspelt key is missing as well, and this message has the right one.
-    for key in plain:
-        if key not in known:
-            raise UserError(f"{prefix}{key}: unknown key{suggestion(str(key), known)}")
-    for key in known:
-        if key not in plain:
-            raise UserError(f"{prefix}{key}: missing")
-    return schema(**{key: _built(key, item, plain[key], prefix) for key, item in known.items()})
+    if cfg.resume is None and (chosen / "config.yaml").is_file():
+        raise UserError(
+            f"{key}={chosen}: holds a run already; resume it by resume=auto, or choose another folder"
+        )
+    if cfg.resume in (None, "auto"):
+        return chosen
+    named = Path(str(cfg.resume))
+    # A checkpoint is RUN/checkpoints/iteration-00000012.pt.
+    folder = named.parent.parent if named.is_file() else named
+    if not (folder / "config.yaml").is_file():
+        raise UserError(
+            f"resume={cfg.resume}: expected auto, the folder of a run, or one of its checkpoints"
+        )
+    return folder
 
 
-def _built(key: str, item: Option | Node, value: Any, prefix: str) -> Any:
-    """The value of one key, or the dataclasses of a part."""
-    if isinstance(item, Option):
-        # `reward: 10` in a file is an integer to YAML; `type` leaves True, which is refused by its own check.
-        return as_float(value) if item.kind is float and type(value) is int else value
-    if value is None and item.optional:
-        return None
-    if value == MISSING:
-        needed = f"{key}=NAME" if key in GROUPS else f"its {', '.join(options(item.schema))}"
-        raise UserError(f"{prefix}{key}: missing, expected {needed}")
-    if item.several and isinstance(value, Mapping):
-        for name in value:
-            check_choice(key, name)
-        return {
-            name: build_config(own, GROUPS[key][name], f"{prefix}{key}.{name}.")
-            for name, own in value.items()
-        }
-    schema = item.schema
-    if key in GROUPS and isinstance(value, Mapping):
-        check_choice(key, value.get("name"))
-        schema = GROUPS[key][value["name"]]
-        value = {own: each for own, each in value.items() if own != "name"}
-    return build_config(value, schema, f"{prefix}{key}.")
+def fixed_options(cfg: TrainConfig) -> dict[str, Any]:
+    """The options by which two runs differ: all but the ones that may change when a run is resumed."""
+    plain = to_dict(cfg)
+    for key in (*CHANGEABLE, "resume"):
+        parent, _, last = key.rpartition(".")
+        (at_key(plain, parent) if parent else plain).pop(
+            last
+        )  # all keys are there: the config is typed
+    return plain
+
+
+def continued(cfg: TrainConfig, folder: Path, words: Sequence[str]) -> TrainConfig:
+    """The config to run with: the saved one, where `cfg.resume` asks for it and `folder` holds a run.
+
+    Args:
+        cfg: typed and composed with the defaults.
+        folder: of the run.
+        words: the typed overrides; only these are compared with the saved config.
+
+    Raises:
+        UserError: an override differs from the saved config and is not in `CHANGEABLE`.
+    """
+    if cfg.resume is None or not (folder / "config.yaml").is_file():
+        return validate(cfg)
+    saved, typed = to_dict(load_run_config(folder)), to_dict(cfg)
+    # Choices before their options: log.mcap.episodes=3 log=[mcap] first adds the mcap.
+    for key in sorted(map(key_of, words), key=lambda key: "." in key):
+        old, new = (_named(at_key(plain, key), key) for plain in (saved, typed))
+        if key.split(".")[0] in ("hydra", "resume") or old == new:
+            continue
+        # With the dot: `log` allows `log.csv.every`, and no option that merely begins with these letters.
+        if not any(f"{key}.".startswith(f"{allowed}.") for allowed in CHANGEABLE):
+            old, new = ("null" if each is None else each for each in (old, new))
+            raise UserError(
+                f"{key}: the run has {old}, typed was {new}; it cannot change on resume"
+            )
+        _put(saved, key, at_key(typed, key))
+    # Checked again: a new budget may break a rule against an option that was not typed, as frames per batch.
+    resumed = validate(build_config(saved, TrainConfig))
+    return dataclasses.replace(resumed, resume=cfg.resume)
+
+
+def key_of(word: str) -> str:
+    """The dotted key that an override sets."""
+    # Hydra's grammar: `algo.epochs=3`, `+key=1` adds, `~key` removes, `group@package=name`, `hydra/launcher=joblib`.
+    return word.lstrip("+~").split("=", 1)[0].split("@")[0].replace("/", ".")
+
+
+def by_key(words: Iterable[str]) -> dict[str, str]:
+    """The text of each key's value, as typed."""
+    return {key_of(word): word.partition("=")[2] for word in words}
+
+
+def at_key(plain: Any, key: str) -> Any:
+    """The value at a dotted key of nested dicts; None where there is no such key, as of another choice of a group."""
+    for name in key.split("."):
+        plain = plain.get(name) if isinstance(plain, dict) else None
+    return plain
+
+
+def _put(plain: dict[str, Any], key: str, value: Any) -> None:
+    """Set a changed option; of several choices those of the run keep their values.
+
+    Raises:
+        UserError: it is an option of a choice that the run does not have.
+    """
+    *parents, last = key.split(".")
+    for name in parents:
+        if name not in plain:
+            names = listed([*plain, name])
+            raise UserError(
+                f"{key}: the run has {parents[0]}={listed(plain)}, expected {parents[0]}={names} beside it"
+            )
+        plain = plain[name]
+    if several(TrainConfig, key):
+        value = {name: plain[last].get(name, own) for name, own in value.items()}
+    plain[last] = value
+
+
+def _named(value: Any, key: str) -> Any:
+    """The name or names of a choice, anything else as it is: options of a choice are compared where they are typed."""
+    if not isinstance(value, dict):
+        return value
+    return listed(value) if several(TrainConfig, key) else value.get("name", value)

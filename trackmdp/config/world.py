@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
-from trackmdp.config.option_fields import count_option, file_option, option, refuse, share_option
-from trackmdp.config.options import ChoiceConfig, NodeConfig, Sizes, choice, require_able
+from trackmdp.config.options import (
+    ChoiceConfig,
+    NodeConfig,
+    choice,
+    count_option,
+    file_option,
+    option,
+    refuse,
+    require_able,
+    share_option,
+)
 from trackmdp.errors import UserError
 
 BORDERS = ("renormalize", "inside", "clip", "exit")
@@ -111,7 +120,7 @@ class TaskConfig(NodeConfig):
         if self.memory != "cell":
             require_able(root, "remembers", f"with {key}.memory={self.memory}")
 
-    def needs(self, task: Sizes, root: Any) -> dict[str, int]:
+    def needs(self, task: Any, root: Any) -> dict[str, int]:
         """A set for every key and n, and its search."""
         if self.memory == "cell":
             return {}
@@ -129,14 +138,9 @@ class KernelConfig(ChoiceConfig):
     The code of a choice gets the size of the grid and the options of the choice, and returns the `[M, M]` kernel.
     """
 
-    is_motion: ClassVar[bool] = True
-    hides: ClassVar[bool] = False
+    is_motion = True
+    hides = False
     """Whether the target has a mode beside its cell (`trackmdp.config.hidden_kernels`)."""
-
-    @property
-    def source(self) -> str:
-        """First words of a message about the kernel."""
-        return f"kernel={self.name}"
 
 
 class ExitingConfig(KernelConfig):
@@ -197,11 +201,6 @@ class TableConfig(KernelConfig):
     """A table of your own: row i holds the probabilities of moving from cell i to each cell."""
 
     path: str = file_option("file with the M x M table", "a path to a .npy, .npz or .csv file")
-
-    @property
-    def source(self) -> str:
-        """First words of a message about the kernel."""
-        return f"kernel.path={self.path}"
 
 
 @choice("kernel", "tracks", makes="trackmdp.world.configured:recorded")

@@ -151,9 +151,9 @@ def function_rule(task: Task, function: Callable[..., Any]) -> Rule:
     except ValueError:  # a builtin without a signature
         pass
 
-    def rule(last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor) -> Tensor:
-        found = function(last_cell, steps_since_detection, action_history)
-        shape = len(last_cell), task.num_sensors
+    def rule(*state: Tensor) -> Tensor:
+        found = function(*state)
+        shape = len(state[0]), task.num_sensors
         try:
             action = torch.as_tensor(found)
         except (RuntimeError, TypeError, ValueError):

@@ -28,8 +28,6 @@ class OnnxTable:
         UserError: onnxruntime is not installed, or the file is missing, damaged or no exported policy.
     """
 
-    deterministic = True
-
     def __init__(self, file: str | Path) -> None:
         require("onnxruntime", "onnx", f"{file}")
         import onnxruntime

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 
@@ -21,16 +21,8 @@ from trackmdp.sensing.task import Task
 
 _NUMBERS = ("key", "misses", "steps", "seed")
 
-
-class Plan(Protocol):
-    """A policy for a tracker: a `Policy` or its table, or an `OnnxTable`."""
-
-    task: Task
-    deterministic: bool
-
-    def sensors(self, key: int, misses: int) -> list[int]:
-        """The sensors that may be on, n misses after the detection that left `key`."""
-        ...
+Plan: TypeAlias = PolicyTable | OnnxTable
+"""A policy for a tracker: a `Policy` or its table, or one in an ONNX file."""
 
 
 class Tracker:
@@ -48,6 +40,12 @@ class Tracker:
         mode: of the target there, where a detection gives it (`kernel.reveals`).
         seed: of the draws of a policy that draws its sets; unused by the others.
         world: with the motion of the target, for `belief()`; None: not known.
+
+    Attributes:
+        key: the memory left by the last detection (`trackmdp.memory.keys`); the cell, where that is all.
+        misses: since the last detection, n; at most t_max + 1.
+        steps: reports so far.
+        seed: of the draws.
 
     Raises:
         UserError: the cell or position is outside the grid; the mode is missing, or given where detections do not
@@ -78,12 +76,12 @@ class Tracker:
     ) -> None:
         self._policy = _plan(policy)
         self._task, self._world = self._policy.task, _checked(world, self._policy.task)
-        self._key, self._misses, self._steps = 0, 0, 0
+        self.key, self.misses, self.steps = 0, 0, 0
         self._on: list[int] | None = None
         self._exited = False
         self._filter = None if world is None else BeliefFilter(world.kernel, world.modes)
         self._belief: Array = np.zeros((1, 0))  # [1, Z] where the motion is known
-        self._seed = whole_number("tracker: seed", seed, 0)
+        self.seed = whole_number("tracker: seed", seed, 0)
         found = self._one("tracker", cell, at)
         if found is None:
             raise UserError("tracker: no cell and no at, expected the first detection")
@@ -97,22 +95,12 @@ class Tracker:
     @property
     def cell(self) -> int:
         """The cell of the last detection."""
-        return int(self._task.keys.cell(self._key))
-
-    @property
-    def key(self) -> int:
-        """The memory left by the last detection (`trackmdp.memory.keys`); the cell, where that is all."""
-        return self._key
-
-    @property
-    def misses(self) -> int:
-        """Misses since the last detection, n; at most t_max + 1."""
-        return self._misses
+        return int(self._task.keys.cell(self.key))
 
     @property
     def safe(self) -> bool:
         """Whether the safe action is due: all sensors on."""
-        return self._misses > self._task.t_max and not self._exited
+        return self.misses > self._task.t_max and not self._exited
 
     def sensors(self) -> list[int]:
         """The ids of the sensors to switch on now, in order; the same until the next report.
@@ -193,11 +181,11 @@ class Tracker:
                 predicted = self._filter.predict(self._belief)
                 self._belief = self._filter.miss(predicted, (self._seen() * chance)[None])
             # The clock stands still where the safe action misses.
-            self._misses = min(self._misses + 1, self._task.num_choices)
+            self.misses = min(self.misses + 1, self._task.num_choices)
         else:
             self._locate("report", cell, mode)
         self._on = None
-        self._steps += 1
+        self.steps += 1
 
     def exited(self) -> None:
         """The target has left the grid; nothing follows.
@@ -210,7 +198,7 @@ class Tracker:
 
     def state(self) -> dict[str, Any]:
         """All that is needed to go on later, as JSON takes it; see `restore`."""
-        numbers = {name: getattr(self, f"_{name}") for name in _NUMBERS}
+        numbers = {name: getattr(self, name) for name in _NUMBERS}
         belief = None if self._filter is None else self._belief[0].tolist()
         own = {"on": self._on, "exited": self._exited, "belief": belief}
         return {"task": self._facts(), **numbers, **own}
@@ -235,11 +223,8 @@ class Tracker:
             raise UserError(f"state: made for {state['task']}, expected {tracker._facts()}")
         most = {"key": task.num_keys - 1, "misses": task.num_choices}
         for name in _NUMBERS:
-            setattr(
-                tracker,
-                f"_{name}",
-                whole_number(f"state: {name}", state[name], 0, most.get(name, math.inf)),
-            )
+            found = whole_number(f"state: {name}", state[name], 0, most.get(name, math.inf))
+            setattr(tracker, name, found)
         if not isinstance(state["exited"], bool):
             raise UserError("state: expected True or False as exited")
         tracker._on, tracker._exited = tracker._restored(state["on"]), state["exited"]
@@ -293,9 +278,9 @@ class Tracker:
                 f"{call}: cell {cell} is seen by none of the {len(self._on or ())} sensors that are on, expected "
                 "one that is, or None"
             )
-        before = np.int64(self._key)
-        key = keys.start(place, own) if first else keys.next(before, self._misses, place, own)
-        self._key, self._misses = int(key), 0
+        before = np.int64(self.key)
+        key = keys.start(place, own) if first else keys.next(before, self.misses, place, own)
+        self.key, self.misses = int(key), 0
         if self._filter is not None:
             told = None if mode is None else np.array([mode])
             predicted = 1.0 if first else self._filter.predict(self._belief)
@@ -304,18 +289,17 @@ class Tracker:
     def _chosen(self) -> list[int]:
         """The policy's own choice, before any safe action."""
         policy = self._policy
-        sensors = np.array(policy.sensors(self._key, self._misses), dtype=np.int64)
+        sensors = np.array(policy.sensors(self.key, self.misses), dtype=np.int64)
         kept = self._possible(sensors)
         sensors = sensors[kept]
-        if policy.deterministic:
+        if isinstance(policy, OnnxTable) or policy.deterministic:
             return sensors.tolist()
-        assert isinstance(policy, PolicyTable)
         # A generator for each step: the state then holds two numbers in place of a generator.
-        draws = np.random.default_rng([self._seed, self._steps]).random(len(sensors))
+        draws = np.random.default_rng([self.seed, self.steps]).random(len(sensors))
         if policy.k is not None:
             # The k largest of independent uniforms are a uniformly random subset of size k.
             return np.sort(sensors[np.argsort(-draws)[: policy.k]]).tolist()
-        return sensors[draws < policy.chances(self._key, self._misses)[kept]].tolist()
+        return sensors[draws < policy.chances(self.key, self.misses)[kept]].tolist()
 
     def _possible(self, sensors: IndexArray) -> BoolArray:
         """Whether each of `sensors` can be on now."""

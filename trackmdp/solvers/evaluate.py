@@ -71,7 +71,7 @@ def evaluate(
     check_problem(problem, "evaluate")
     if of_group:
         raise UserError(f"{min(of_group)}: an option of several targets, expected none with one")
-    table = _table(problem, policy)
+    table = policy_table(problem, policy)
     if false_alarm:
         value.check_revealed(problem.motion, table)
         return believed(problem, table, false_alarm)
@@ -95,7 +95,7 @@ def group_rule(group: Group, policy: Any, merge: str | None = None) -> Rule:
     held = policy if isinstance(policy, Rule) else getattr(policy, "policy", None)
     if not isinstance(held, Rule):
         singles = [group.single] if group.recorded else group.kinds
-        return make_rule(group, [_table(each, policy) for each in singles], merge)
+        return make_rule(group, [policy_table(each, policy) for each in singles], merge)
     rule = held.within(group)
     if merge in (None, rule.name):
         return rule
@@ -104,7 +104,7 @@ def group_rule(group: Group, policy: Any, merge: str | None = None) -> Rule:
     return make_rule(group, rule.tables, merge)
 
 
-def _table(problem: Problem, policy: PolicyLike | Array | BoolArray) -> PolicyTable:
+def policy_table(problem: Problem, policy: PolicyLike | Array | BoolArray) -> PolicyTable:
     """The table of a policy in any form; a name is that of a baseline."""
     made = named_policy(problem, policy) if isinstance(policy, str) else policy
     return value.as_table(problem, made)

@@ -45,6 +45,10 @@ class FrontierProgress:
     left: float
     seconds: float
 
+    def __str__(self) -> str:
+        counts = f"{self.prices} prices  {self.corners} corners"
+        return f"{self.seconds:.0f} s  {counts}  {self.left:.2g} left"
+
 
 Watch = Callable[[FrontierProgress], None]
 

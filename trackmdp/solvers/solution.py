@@ -111,6 +111,11 @@ class SearchProgress:
     stage: str = ""
     left: float | None = None
 
+    def __str__(self) -> str:
+        bracket = f"bracket {self.lower:,.4f} ... {self.upper:,.4f}"
+        line = f"{self.seconds:.0f} s  {bracket}  {self.nodes:,} nodes"
+        return line if self.left is None else f"{line}  {self.stage}, {self.left:.0f} s left"
+
 
 def bracketed(
     world: World,

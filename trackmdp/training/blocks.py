@@ -8,7 +8,6 @@ not learned again on resume, and a block that was interrupted goes on from its o
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,13 +33,12 @@ from trackmdp.solvers.partition import (
     sensing_blocks,
 )
 from trackmdp.solvers.workers import crew
-from trackmdp.training.callbacks import Callback, Learning, Position
+from trackmdp.training.callbacks import Learning, Position
 from trackmdp.training.display import make_console
 from trackmdp.training.evaluator import Score
-from trackmdp.training.folders import SUMMARY, finished, read_summary
+from trackmdp.training.folders import SUMMARY, finished, locked, read_summary
 from trackmdp.training.group_run import evaluator_of
 from trackmdp.training.inputs import identity, problem_of, with_own_classes, words_of, write_inputs
-from trackmdp.training.lock import locked
 from trackmdp.training.run import complete, load_run
 from trackmdp.training.trainer import Trainer
 from trackmdp.world.group import Subject, one_target
@@ -50,13 +48,7 @@ from trackmdp.world.problem_file import PROBLEM, problem_bytes
 
 
 def make_trainer(
-    problem: Subject,
-    config: TrainConfig,
-    *,
-    folder: Path | None = None,
-    callbacks: Sequence[Callback] = (),
-    console: Console | None = None,
-    nets: Mapping[str, Any] | None = None,
+    problem: Subject, config: TrainConfig, folder: Path | None, console: Console, **own: Any
 ) -> Learning:
     """The trainer of the whole grid, or of its blocks where `partition.block` is set; arguments as for `Trainer`.
 
@@ -64,13 +56,11 @@ def make_trainer(
         UserError: callbacks or networks are given for blocks, or as `Trainer` raises it.
     """
     if config.partition.block is None:
-        return Trainer(
-            problem, config, folder=folder, callbacks=callbacks, console=console, nets=nets
-        )
-    if callbacks or nets:
+        return Trainer(problem, config, folder=folder, console=console, **own)
+    if any(own.values()):
+        what = "callbacks" if own["callbacks"] else "actor, critic"
         raise UserError(
-            f"{'callbacks' if callbacks else 'actor, critic'}: expected none with partition.block, whose blocks may "
-            "learn in other processes"
+            f"{what}: expected none with partition.block, whose blocks may learn in other processes"
         )
     return BlockTrainer(problem, config, folder, console)
 
@@ -101,14 +91,13 @@ class BlockTrainer(Learning):
         parts = sensing_blocks(world, side, halo)
         with ExitStack() as opened:
             place = self.folder or Path(opened.enter_context(TemporaryDirectory()))
-            resumed = self.folder is not None and _resumed(self.config, world, place)
+            resumed = _resumed(self.config, world, place)
             # A block handles signals while it learns; here they end the work between two blocks, and all workers.
             opened.enter_context(handled(stop, *HEARD))
             # Before anything is written: where there is no such cluster, no run has begun.
             run = opened.enter_context(crew(min(cfg.workers, len(parts)), cfg.cluster))
-            if self.folder is not None:
-                write_inputs(self.config, world, place, resumed=resumed)
-                write_json(place / "plan.json", {"blocks": len(parts)})  # for `watch`
+            write_inputs(self.config, world, place, resumed=resumed)
+            write_json(place / "plan.json", {"blocks": len(parts)})  # for `watch`
             own_folder(place / "blocks")
             config = with_own_classes(self.config, place) if resumed else self.config
             learner = _BlockLearner(config, place.absolute() / "blocks", parts)

@@ -11,17 +11,15 @@ import numpy as np
 
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, counted_words, decimal, percent
-from trackmdp.policies.policy import Policy, as_policy
+from trackmdp.policies.table import PolicyTable
 from trackmdp.recordings.tracks import Recorded
-from trackmdp.solvers.evaluate import group_rule
+from trackmdp.solvers.evaluate import group_rule, policy_table
 from trackmdp.solvers.several.group_value import evaluate_group
 from trackmdp.solvers.several.merging import Rule
-from trackmdp.solvers.solve import named_policy
 from trackmdp.solvers.value import replay, value_of
 from trackmdp.statistics import MeanInterval, ratio
 from trackmdp.training.evaluator import estimated_qmdp
 from trackmdp.world.group import Group, Subject, check_problem
-from trackmdp.world.problem import Problem
 
 FIGURES = ("aihtr", "accuracy", "sensors_per_step")
 Figures: TypeAlias = dict[str, MeanInterval]
@@ -80,7 +78,11 @@ class Comparison(Carded):
         """AIHTR, accuracy, sensors per step and the difference to the first policy, in words."""
         aihtr, accuracy, sensors = (row.figures[name].mean for name in FIGURES)
         shown = [decimal(aihtr), percent(accuracy), decimal(sensors, 2)]
-        return [*shown, "–" if row is self.policies[0] else _with_interval(row.difference)]
+        less = row.difference
+        difference = decimal(less.mean)
+        if less.low != less.high:
+            difference += f" ({decimal(less.low)} ... {decimal(less.high)})"
+        return [*shown, "–" if row is self.policies[0] else difference]
 
     @property
     def sentences(self) -> list[str]:
@@ -89,12 +91,6 @@ class Comparison(Carded):
         exact = self.tracks is None
         unit = "episode" if exact else self.units[0].split()[-1]
         return [_sentence(first, each, unit, exact=exact) for each in others]
-
-
-def _with_interval(found: MeanInterval) -> str:
-    if found.low is None or found.low == found.high:
-        return decimal(found.mean)
-    return f"{decimal(found.mean)} ({decimal(found.low)} ... {decimal(found.high)})"
 
 
 def _sentence(first: Compared, other: Compared, unit: str, *, exact: bool) -> str:
@@ -143,7 +139,7 @@ def compare(problem: Subject, policies: Mapping[str, Any] | Sequence[Any]) -> Co
         raise UserError(f"compare: {len(named)} policies, expected at least two")
     if isinstance(problem, Group):
         return _of_group(problem, _made(problem, named, partial(group_rule, problem)))
-    tables = _made(problem, named, partial(_table, problem))
+    tables = _made(problem, named, partial(policy_table, problem))
     if problem.recorded is not None:
         return _on_tracks(problem.recorded, tables)
     found = {name: value_of(problem, table) for name, table in tables.items()}
@@ -159,7 +155,7 @@ def compare(problem: Subject, policies: Mapping[str, Any] | Sequence[Any]) -> Co
     return Comparison(tuple(rows), None)
 
 
-def _on_tracks(problem: Recorded, tables: Mapping[str, Policy]) -> Comparison:
+def _on_tracks(problem: Recorded, tables: Mapping[str, PolicyTable]) -> Comparison:
     """Figures over the held-out tracks; each target's own difference makes up the differences."""
     tracks = problem.held_out.limited(problem.max_steps)
     target = np.unique(tracks.names, return_inverse=True)[1]
@@ -224,9 +220,3 @@ def _named(policies: Sequence[Any]) -> dict[str, Any]:
         each if isinstance(each, str) else f"{type(each).__name__} {place}": each
         for place, each in enumerate(policies, start=1)
     }
-
-
-def _table(problem: Problem, policy: Any) -> Policy:
-    """The policy as a table."""
-    named = isinstance(policy, str)
-    return named_policy(problem, policy) if named else as_policy(problem.task, policy)

@@ -7,15 +7,15 @@ import os
 import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields
 from importlib.metadata import version
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from trackmdp.config import TrainConfig
-from trackmdp.config.options import Sizes, nodes
+from trackmdp.config.options import nodes
 from trackmdp.errors import UserError
 from trackmdp.machine import free_bytes, gib
 from trackmdp.sensing.task import Task
@@ -52,7 +52,7 @@ def check_memory(cfg: TrainConfig, task: Task, device: torch.device) -> str:
     total = sum(parts.values())
     key = max(parts, key=lambda name: parts[name])
     if total > free:
-        value = getattr(getattr(cfg, key.split(".")[0]), key.split(".")[1])
+        value = attrgetter(key)(cfg)
         raise UserError(f"{key}={value}: needs about {gib(total)}, {gib(free)} are available")
     return f"memory: about {gib(total)} of {gib(free)}, most by {key}"
 
@@ -60,9 +60,8 @@ def check_memory(cfg: TrainConfig, task: Task, device: torch.device) -> str:
 def needs(cfg: TrainConfig, task: Task) -> dict[str, int]:
     """Bytes of the replay buffer, of collected batches and of networks, by the option that they grow with."""
     parts: dict[str, int] = {}
-    sizes = Sizes(**{field.name: getattr(task, field.name) for field in fields(Sizes)})
     for _, node in nodes(cfg):
-        parts |= node.needs(sizes, cfg)
+        parts |= node.needs(task, cfg)
     return parts
 
 

@@ -8,12 +8,12 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any
 
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.status import Status
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from trackmdp.notebook.card import counted_words, decimal
@@ -117,7 +117,6 @@ class Display(Callback):
         )
 
 
-_T = TypeVar("_T")
 FIGURES = {
     "aihtr": "AIHTR",
     "accuracy": "accuracy",
@@ -136,25 +135,22 @@ _HELD_OUT: tuple[tuple[Any, ...], ...] = (
 
 
 @contextmanager
-def reporting(
-    console: Console, title: str, line_of: Callable[[_T], str]
-) -> Iterator[Callable[[_T], None]]:
+def reporting(console: Console, title: str) -> Iterator[Callable[[object], None]]:
     """Show a search as it goes on: one changing line at a terminal, a plain line now and then when piped.
 
     A scheduler's signals end it as Ctrl-C does, with its workers; by themselves they would end this process alone.
 
     Args:
         console: where.
-        title: before each line.
-        line_of: a progress in words.
+        title: before each line, which is the text of a progress.
     """
     last = time.monotonic()
     ended = handled(stop, signal.SIGTERM, signal.SIGUSR1)
     with ended, console.status(title) as status:
 
-        def show(progress: _T) -> None:
+        def show(progress: object) -> None:
             nonlocal last
-            line = f"{title}: {line_of(progress)}"
+            line = f"{title}: {progress}"
             if console.is_terminal:
                 status.update(line)
             elif time.monotonic() - last >= _SECONDS_BETWEEN_LINES:
@@ -166,9 +162,9 @@ def reporting(
 
 def table(title: str, columns: list[str], rows: list[list[str]]) -> Table:
     """A table with its first column to the left and the others to the right."""
-    made = Table(title=title, title_justify="left")
-    for index, column in enumerate(columns):
-        made.add_column(column, justify="left" if index == 0 else "right")
+    first, *others = columns
+    right = (Column(each, justify="right") for each in others)
+    made = Table(first, *right, title=title, title_justify="left")
     for row in rows:
         made.add_row(*row)
     return made

@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 
 from trackmdp.algos.estimates.alike import cell_classes
-from trackmdp.arrays.types import Array
 from trackmdp.config import TrainConfig
 from trackmdp.config.checks import own_paths
 from trackmdp.config.learning import file_of_classes
-from trackmdp.config.resume import fixed_options
-from trackmdp.config.tree import config_text
+from trackmdp.config.tree import config_text, fixed_options
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.world.configured import make_problem
 from trackmdp.world.group import Group, Subject, learned_in
@@ -68,8 +66,12 @@ def words_of(given: Subject, folder: Path | None, subject: Subject | None = None
     problem = given.single
     for name, option in OF_TASK.items():
         value = getattr(problem, name)
-        array = isinstance(value, np.ndarray)
-        words[option] = _as_word(value, folder or Path()) if array else value
+        if isinstance(
+            value, np.ndarray
+        ):  # the one number that all have, or the file of the run's arrays
+            file = str((folder or Path()).absolute() / PROBLEM)
+            value = float(value[0]) if (value == value[0]).all() else file
+        words[option] = value
     if problem.memory == "cell":
         words.pop("task.clip")  # nothing reads it
     if not (problem.perfect and problem.safe and problem.coverage is None):
@@ -82,12 +84,6 @@ def words_of(given: Subject, folder: Path | None, subject: Subject | None = None
         "kernel.reveals": problem.revealed > 1,
         "kernel.digest": problem_digest(subject or given)[:16],
     }
-
-
-def _as_word(values: Array, folder: Path) -> float | str:
-    """Numbers per cell or sensor as an option: the one number that all have, or the file of the run's arrays."""
-    same = (values == values[0]).all()
-    return float(values[0]) if same else str(folder.absolute() / PROBLEM)
 
 
 def identity(config: TrainConfig, folder: Path, problem: Subject) -> str:

@@ -1,21 +1,27 @@
-"""Loggers that end with the results of a run, and TensorBoard's among them."""
+"""Loggers that end with the results of a run: TensorBoard, Weights & Biases, and MLflow."""
 
 from __future__ import annotations
 
+import os
+import secrets
 import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from trackmdp.config import to_dict, to_yaml
+from trackmdp.config import MlflowConfig, WandbConfig, to_dict, to_yaml
 from trackmdp.config.tree import flatten
-from trackmdp.durable import own_folder
+from trackmdp.durable import own_folder, reopen
+from trackmdp.errors import Preempted, RunError
 from trackmdp.notebook.drawing import drawn
 from trackmdp.solvers.evaluation import figures
-from trackmdp.training.callbacks import Row, Training
-from trackmdp.training.loggers import RowLogger, known
+from trackmdp.training.callbacks import Row, RowLogger, Training, known
+from trackmdp.untrusted import reason
 from trackmdp.world.group import Group
 
 
@@ -117,3 +123,175 @@ class TensorboardLogger(ResultLogger):
     def close(self, error: BaseException | None) -> None:  # noqa: ARG002
         """Close the file."""
         self._events.close()
+
+
+class _Tracker(ResultLogger):
+    """Logs to a run that has an id of its own, under which a resumed one goes on."""
+
+    _id = ""  # until the run is begun
+
+    def state_dict(self) -> dict[str, Any]:
+        """The id of the run."""
+        return {"id": self._id}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with the run of that id."""
+        self._id = str(state["id"])
+
+
+class WandbLogger(_Tracker):
+    """Weights & Biases: config, a row per logged iteration over frames, final figures, pictures, the policy.
+
+    A resumed run goes on under the same id. Offline each process leaves a folder `wandb/offline-run-*` of its own;
+    `wandb sync` puts them together.
+    """
+
+    name = "wandb"
+    _cfg: WandbConfig
+
+    def on_start(self, trainer: Training) -> None:
+        """Begin the run, or go on with it.
+
+        Raises:
+            RunError: the server cannot be reached, or nobody is logged in.
+        """
+        if self._cfg.mode == "offline":
+            # Reports of wandb's own faults would go out over the network all the same.
+            os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
+        import wandb
+
+        own_folder(self._folder / "wandb")
+        self._id = self._id or secrets.token_hex(4)
+        # No console capture, machine statistics or code: only the run's figures are logged.
+        quiet = wandb.Settings(
+            silent=True,
+            console="off",
+            disable_code=True,
+            disable_git=True,
+            x_disable_stats=True,
+            x_save_requirements=False,
+        )
+        with _answering("wandb"):
+            self._run = wandb.init(
+                name=self._folder.resolve().name,
+                dir=self._folder,
+                id=self._id,
+                resume="allow",
+                project=self._cfg.project,
+                mode=cast(Any, self._cfg.mode),
+                config=to_dict(trainer.config),
+                settings=quiet,
+            )
+        # Its own step is the iteration: after the last frame there are more of these, which would be one row.
+        self._run.define_metric("*", step_metric="frames")
+
+    def write(self, row: Row) -> None:
+        """Log the row."""
+        self._run.log(known(row), step=int(row["iteration"] or 0))
+
+    def results(self, found: FinalResults, trainer: Training) -> None:
+        """Log the pictures, leave the final figures in the summary, and add the policy as an artifact."""
+        import wandb
+
+        images = {name: wandb.Image(picture) for name, picture in found.pictures.items()}
+        self._run.log(images, step=trainer.position.iteration)
+        self._run.summary.update(found.figures)
+        artifact = wandb.Artifact(f"policy-{self._id}", type="model")
+        artifact.add_file(str(found.policy))
+        self._run.log_artifact(artifact)
+
+    def close(self, error: BaseException | None) -> None:
+        """Close the run."""
+        self._run.finish(exit_code=0 if error is None else 1)
+
+
+class MlflowLogger(_Tracker):
+    """MLflow: the options as parameters, a row per logged iteration, final figures, pictures, the policy.
+
+    By MLflow's client itself, for TorchRL's logger always begins another run. A resumed run goes on with the same one;
+    rows that an earlier process logged after its last checkpoint are not logged twice.
+    """
+
+    name = "mlflow"
+    _cfg: MlflowConfig
+    _logged = 0  # iteration of the last row that is there
+
+    def on_start(self, trainer: Training) -> None:
+        """Begin the run, or go on with it.
+
+        Raises:
+            RunError: the server or the database cannot be reached.
+            UserError: the database of the run's folder is a link, or no ordinary file.
+        """
+        if self._cfg.uri is None:
+            # SQLite would follow a link out of the folder; an empty file is a new database to it.
+            os.close(reopen(self._folder / "mlflow.db"))
+            # Reports of how mlflow is used would go out over the network from a run that is to stay here.
+            os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+        # Its database reports on standard error which tables it makes.
+        os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
+        from mlflow import MlflowClient
+
+        uri = self._cfg.uri or f"sqlite:///{self._folder.resolve() / 'mlflow.db'}"
+        with _answering("mlflow"):
+            self._client = MlflowClient(uri)
+            if not self._id:
+                self._begin(trainer)
+            else:
+                self._client.update_run(self._id, status="RUNNING")
+                rows = self._client.get_metric_history(self._id, "iteration")
+                self._logged = max((int(row.value) for row in rows), default=0)
+
+    def _begin(self, trainer: Training) -> None:
+        from mlflow.entities import Param
+
+        found = self._client.get_experiment_by_name(self._cfg.experiment)
+        # The default place of artifacts is a folder where the command was typed.
+        place = (self._folder.resolve() / "mlflow").as_uri() if self._cfg.uri is None else None
+        number = (
+            found.experiment_id
+            if found
+            else self._client.create_experiment(self._cfg.experiment, place)
+        )
+        run = self._client.create_run(number, run_name=self._folder.resolve().name)
+        self._id = run.info.run_id
+        options = [Param(*each) for each in typed(trainer).items()]
+        for begin in range(0, len(options), 100):  # no more are taken at a time
+            self._client.log_batch(self._id, params=options[begin : begin + 100])
+
+    def write(self, row: Row) -> None:
+        """Log the row, unless it is there."""
+        measured = known(row)
+        if measured["iteration"] > self._logged:
+            self._log(measured, int(measured["iteration"]))
+
+    def _log(self, row: Mapping[str, float], iteration: int) -> None:
+        from mlflow.entities import Metric
+
+        now = int(time.time() * 1000)
+        with _answering("mlflow"):
+            self._client.log_batch(
+                self._id, metrics=[Metric(key, value, now, iteration) for key, value in row.items()]
+            )
+
+    def results(self, found: FinalResults, trainer: Training) -> None:
+        """Log the final figures, and pictures and policy as artifacts."""
+        self._log(found.figures, trainer.position.iteration)
+        with _answering("mlflow"):
+            for name, picture in found.pictures.items():
+                self._client.log_image(self._id, picture, f"{name}.png")
+            self._client.log_artifact(self._id, found.policy)
+
+    def close(self, error: BaseException | None) -> None:
+        """Note how the run ended."""
+        ended = "KILLED" if isinstance(error, Preempted) else "FAILED"
+        self._client.set_terminated(self._id, "FINISHED" if error is None else ended)
+
+
+@contextmanager
+def _answering(name: str) -> Iterator[None]:
+    """One line where a logger cannot do its work; the run can be resumed."""
+    try:
+        yield
+    except Exception as error:  # any error of the package, its network or its database
+        raise RunError(f"log=[{name}]: {reason(error)}") from error

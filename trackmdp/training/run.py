@@ -39,13 +39,11 @@ from trackmdp.training.evaluator import Evaluator, Score, fixed_policies, while_
 from trackmdp.training.folders import SUMMARY, check_files, read_summary, write_summary
 from trackmdp.training.group_run import Several, beside, learned_policy
 from trackmdp.training.inputs import problem_of, with_own_classes
-from trackmdp.training.state import load_learned
+from trackmdp.training.state import PACKAGES, load_learned
 from trackmdp.untrusted import LARGE, decoded, read_text
-from trackmdp.world.group import Subject, group_of, one_target
-from trackmdp.world.problem import Problem
+from trackmdp.world.group import Subject, group_of
 
 _PROVED = ("lower", "upper", "certified", "timed_out")
-_PACKAGES = ("torch", "torchrl", "tensordict", "hydra-core", "numpy", "scipy")
 Metrics = dict[str, list[float | int | None]]
 """Columns by their names, as in `metrics.csv`: one value for each logged iteration, None for missing figures."""
 
@@ -89,13 +87,13 @@ class Run(Carded):
             UserError: the run is of one target, or these are other cells than one of the grid for each target.
         """
         if self.several is not None:
-            return GroupTracker(
-                group_rule(self.several.group, self.policy, self.several.merge), cells
-            )
-        if self.folder is not None and (cfg := load_run_config(self.folder)).targets.count > 1:
+            rule = group_rule(self.several.group, self.policy, self.several.merge)
+        elif self.folder is not None and (cfg := load_run_config(self.folder)).targets.count > 1:
             group = group_of(problem_of(cfg, self.folder), cfg.targets.count)
-            return GroupTracker(group_rule(group, self.policy, cfg.targets.merge), cells)
-        raise UserError("tracker: a run of one target, expected run.policy.tracker(cell)")
+            rule = group_rule(group, self.policy, cfg.targets.merge)
+        else:
+            raise UserError("tracker: a run of one target, expected run.policy.tracker(cell)")
+        return GroupTracker(rule, cells)
 
     def card(self) -> Card:
         """Algorithm, budget, figures, bound and folder."""
@@ -138,39 +136,34 @@ def complete(trainer: Learning) -> Run:
         UserError, Preempted, RunError: see `trainer.Trainer.run`.
     """
     with torch_threads(trainer.config.threads), reused_memory():
-        return _complete(trainer)
-
-
-def _complete(trainer: Learning) -> Run:
-    """See `complete`."""
-    began, used = time.monotonic(), time.process_time()
-    rows = _Rows()
-    trainer.callbacks.append(rows)
-    score = trainer.run()
-    policy = trainer.policy()
-    solution = _solve(trainer, policy)
-    several = _several(trainer, policy, solution)
-    if several is not None and trainer.problem.targets:
-        score = several.score
-    # Exact figures were scored already; on recorded tracks the held-out ones are looked at here for the first
-    # time.
-    recorded = trainer.problem.model is None and not trainer.problem.targets
-    final = trainer.evaluator.evaluate(policy) if recorded else score.evaluation
-    if solution is not None:  # the score keeps the evaluation that it is of
-        score = trainer.evaluator.tighten(solution.lower, solution.upper, score)
-    times = {
-        "wall_seconds": time.monotonic() - began + trainer.start.seconds,
-        "cpu_seconds": time.process_time() - used,
-    }
-    summary = summarize(trainer, final, score, solution, times)
-    summary["several"] = None if several is None else several.report()
-    if trainer.folder is not None:
-        policy.save(trainer.folder / "policy.npz", final.value)
-        # Last, for a folder with a summary is a finished run.
-        write_summary(trainer.folder, summary)
-    # A resumed run's earlier rows are in its file alone.
-    columns = (trainer.folder and read_metrics(trainer.folder)) or rows.columns
-    return Run(policy, final, columns, summary, trainer.folder, solution, several)
+        began, used = time.monotonic(), time.process_time()
+        rows = _Rows()
+        trainer.callbacks.append(rows)
+        score = trainer.run()
+        policy = trainer.policy()
+        solution = _solve(trainer, policy)
+        several = _several(trainer, policy, solution)
+        if several is not None and trainer.problem.targets:
+            score = several.score
+        # Exact figures were scored already; on recorded tracks the held-out ones are looked at here for the first
+        # time.
+        recorded = trainer.problem.model is None and not trainer.problem.targets
+        final = trainer.evaluator.evaluate(policy) if recorded else score.evaluation
+        if solution is not None:  # the score keeps the evaluation that it is of
+            score = trainer.evaluator.tighten(solution.lower, solution.upper, score)
+        times = {
+            "wall_seconds": time.monotonic() - began + trainer.start.seconds,
+            "cpu_seconds": time.process_time() - used,
+        }
+        summary = summarize(trainer, final, score, solution, times)
+        summary["several"] = None if several is None else several.report()
+        if trainer.folder is not None:
+            policy.save(trainer.folder / "policy.npz", final.value)
+            # Last, for a folder with a summary is a finished run.
+            write_summary(trainer.folder, summary)
+        # A resumed run's earlier rows are in its file alone.
+        columns = (trainer.folder and read_metrics(trainer.folder)) or rows.columns
+        return Run(policy, final, columns, summary, trainer.folder, solution, several)
 
 
 def _solve(trainer: Learning, learned: Policy) -> Solution | None:
@@ -286,7 +279,7 @@ def summarize(
         "held_out": evaluator.held_out(trainer.policy()),
         "place": place.facts() if (place := trainer.problem.task.place) else None,
         "versions": {"trackmdp": __version__, "python": platform.python_version()}
-        | {name: version(name) for name in _PACKAGES},
+        | {name: version(name) for name in PACKAGES},
         "machine": machine(),
         "config_sha256": config_digest(config, trainer.folder),
     }
@@ -325,15 +318,3 @@ def trained(run: str, device: torch.device, *, best: bool = False) -> tuple[Subj
     load_learned(algorithm, cfg, world, file, device)
     policy = learned_policy(world, algorithm.actor, device)
     return world, policy, f"{cfg.algo.name}, {file.name}"
-
-
-def trained_alone(
-    run: str, device: torch.device, *, best: bool = False
-) -> tuple[Problem, Policy, str]:
-    """As `trained`, of a run that learned of a single target.
-
-    Raises:
-        UserError: it did not.
-    """
-    subject, policy, name = trained(run, device, best=best)
-    return one_target(subject, f"run={run}"), policy, name

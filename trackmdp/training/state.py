@@ -23,7 +23,7 @@ from trackmdp.training.inputs import identity
 from trackmdp.untrusted import decoded
 from trackmdp.world.group import Subject
 
-_EXACT = ("torch", "torchrl", "tensordict", "numpy", "scipy", "hydra-core", "trackmdp")
+PACKAGES = ("torch", "torchrl", "tensordict", "hydra-core", "numpy", "scipy")
 _NOT_WEIGHTS = {"optimizer", "buffer", "generator", "explore", "unit"}
 """Parts of a state that are not learned: how much is explored, and the prices in which `AdditiveQ` counts, are the new
 run's own."""
@@ -56,7 +56,7 @@ def _versions(cfg: TrainConfig) -> dict[str, str]:
     """Of all that draws and rounds: packages, and kinds of devices, whose generators differ."""
     devices = {"device": cfg.device, "collector.device": cfg.collector.device}
     kinds = {key: make_device(name, key).type for key, name in devices.items()}
-    return {name: version(name) for name in _EXACT} | kinds
+    return {name: version(name) for name in (*PACKAGES, "trackmdp")} | kinds
 
 
 def restore(state: Mapping[str, Any], algorithm: Algorithm, collector: BaseCollector) -> Position:

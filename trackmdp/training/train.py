@@ -16,15 +16,15 @@ from tensordict.nn import (
 from trackmdp.config import GROUPS, TrainConfig, options
 from trackmdp.config.compose import compose, default, given
 from trackmdp.config.logs import require_packages
-from trackmdp.config.resume import run_folder
+from trackmdp.config.tree import run_folder
 from trackmdp.environment.observation import ObservationVector
 from trackmdp.errors import UserError, path_of
 from trackmdp.seeding import preserved_global_rng
 from trackmdp.training.blocks import make_trainer
 from trackmdp.training.callbacks import Callback
 from trackmdp.training.display import make_console
+from trackmdp.training.folders import locked
 from trackmdp.training.inputs import words_of
-from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
 from trackmdp.untrusted import reason
 from trackmdp.world.group import Group, Subject, check_problem, learned_in
@@ -89,9 +89,7 @@ def train(
     with locked(place, "folder") if place else nullcontext(), preserved_global_rng():
         console = make_console(quiet=not progress)
         return complete(
-            make_trainer(
-                subject, config, folder=place, callbacks=callbacks, console=console, nets=nets
-            )
+            make_trainer(subject, config, place, console, callbacks=callbacks, nets=nets)
         )
 
 

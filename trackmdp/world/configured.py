@@ -56,7 +56,9 @@ def build_world(cfg: WorldConfig) -> World:
     try:
         return World(made, cfg.grid.sides, **task, **modes)
     except UserError as error:  # with the option at fault
-        raise UserError(re.sub("^kernel(?=:)", lambda _: cfg.kernel.source, str(error))) from None
+        path = own.get("path")
+        source = f"kernel={cfg.kernel.name}" if path is None else f"kernel.path={path}"
+        raise UserError(re.sub("^kernel(?=:)", lambda _: source, str(error))) from None
 
 
 def recorded(
@@ -114,4 +116,6 @@ def of_task(cfg: WorldConfig) -> dict[str, Any]:
     limits = {"t_max": cfg.grid.t_max, "max_steps": cfg.grid.max_steps, "window": cfg.grid.window}
     # Recorded tracks come with their place.
     place = {"place": Place.of(**cfg.grid.place)} if cfg.kernel.is_motion else {}
-    return costs | sensors | limits | place | cfg.remembered
+    # The cell, where the command has no options of memory.
+    memory = {"memory": cfg.task.memory, "clip": cfg.task.clip} if hasattr(cfg, "task") else {}
+    return costs | sensors | limits | place | memory

@@ -12,15 +12,14 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from trackmdp.app.composer import Composer
-from trackmdp.app.sweep.configs import Configs
-from trackmdp.app.sweep.plan import combinations, plan
+from trackmdp.app.sweep.plan import Configs, combinations, plan
 from trackmdp.config import ROOTS
 from trackmdp.config.compose import composed_values, config_of
 from trackmdp.errors import UserError
 
 
 def typed_config(composed: Any) -> Any:
-    return config_of(composed_values(composed, ROOTS["train"]), ROOTS["train"], Path.cwd())
+    return config_of(composed_values(composed, ROOTS["train"]), ROOTS["train"])
 
 
 class Counting:

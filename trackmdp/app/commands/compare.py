@@ -26,19 +26,20 @@ def run(cfg: CompareConfig, folder: Path, problem: Subject) -> None:
     """
     torch.set_num_threads(1)  # as in `evaluate`: networks of few rows wait long for more
     console, policies = make_console(cfg.quiet), dict[str, Any]()
-    found = [trained(each, torch.device("cpu")) for each in cfg.runs or []]
-    count = max((load_run_config(each).targets.count for each in cfg.runs or []), default=1)
+    runs, baselines = cfg.runs or [], cfg.baselines or []
+    found = [trained(each, torch.device("cpu")) for each in runs]
+    count = max((load_run_config(each).targets.count for each in runs), default=1)
     if count > 1:
         found = [(group_of(own, count), *rest) for own, *rest in found]
     if found:
         problem = found[0][0]
     # A run's folder may have the name of another's, or of a baseline; then its whole path is shown.
-    same = Counter([*(Path(each).name for each in cfg.runs or []), *(cfg.baselines or [])])
-    for each, (own, policy, _) in zip(cfg.runs or [], found, strict=True):
+    same = Counter([*(Path(each).name for each in runs), *baselines])
+    for each, (own, policy, _) in zip(runs, found, strict=True):
         name = Path(each).name if same[Path(each).name] == 1 else each
         elsewhere = "" if _digest(own) == _digest(problem) else " (other problem)"
         policies[name + elsewhere] = policy
-    policies |= {name: name for name in cfg.baselines or []}
+    policies |= {name: name for name in baselines}
     compared = compare(problem, policies)
     write_json(folder / "comparison.json", _report(compared))
     shown = any(each.difference.low is not None for each in compared.policies[1:])

@@ -7,12 +7,12 @@ from pathlib import Path
 import torch
 
 from trackmdp.config import ExportConfig
-from trackmdp.policies.export import export
-from trackmdp.policies.geojson import checked_place
+from trackmdp.policies.export import checked_place, export
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.solvers.value import value_of
 from trackmdp.training.display import make_console
-from trackmdp.training.run import trained_alone
+from trackmdp.training.run import trained
+from trackmdp.world.group import one_target
 
 
 def run(cfg: ExportConfig, folder: Path) -> None:
@@ -22,7 +22,8 @@ def run(cfg: ExportConfig, folder: Path) -> None:
         UserError: there is no such run, or a package that `cfg.format` needs is missing.
     """
     best = cfg.checkpoint == "best"
-    world, policy, subject = trained_alone(cfg.run, torch.device("cpu"), best=best)
+    world, policy, subject = trained(cfg.run, torch.device("cpu"), best=best)
+    world = one_target(world, f"run={cfg.run}")
     if cfg.format == "sets":
         file = folder / sets_name(policy)
         write_sets(folder, policy)

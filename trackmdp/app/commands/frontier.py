@@ -11,7 +11,7 @@ from rich.console import Console
 from trackmdp.config import FrontierConfig
 from trackmdp.durable import csv_text, own_folder, write_bytes, write_json, write_text
 from trackmdp.policies.saved import sets_name, write_sets
-from trackmdp.solvers.frontier import FrontierProgress, trace
+from trackmdp.solvers.frontier import trace
 from trackmdp.solvers.tradeoff import Corner, Mixture, Tradeoff
 from trackmdp.training.display import make_console, reporting, table
 from trackmdp.world.problem import Problem
@@ -31,7 +31,7 @@ def run(cfg: FrontierConfig, folder: Path, world: Problem) -> None:
         UserError: no policy has the accuracy asked for; the files are written by then.
     """
     console = make_console(cfg.quiet)
-    with reporting(console, f"frontier {cfg.solver.name}", _progress) as show:
+    with reporting(console, f"frontier {cfg.solver.name}") as show:
         found = trace(world, cfg.solver, cfg.resolution, show)
     rows = [_row(number, corner, found) for number, corner in enumerate(found.corners)]
     write_corners(folder / "corners", found)
@@ -176,9 +176,3 @@ def show_mixture(console: Console, asked: str, mixture: Mixture, found: Tradeoff
         rows.append(["mixture", "1.0000", *_figures(mixture, found)])
         title = f"{asked}: a policy is drawn at the start of each episode"
     console.print(table(title, ["policy", "probability", *_heads(found)], rows))
-
-
-def _progress(found: FrontierProgress) -> str:
-    """How far the search is."""
-    counts = f"{found.prices} prices  {found.corners} corners"
-    return f"{found.seconds:.0f} s  {counts}  {found.left:.2g} left"

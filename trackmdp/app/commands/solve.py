@@ -19,7 +19,7 @@ from trackmdp.solvers.frontier import trace
 from trackmdp.solvers.hidden import averaged
 from trackmdp.solvers.linear import DIRECT_CELLS
 from trackmdp.solvers.partition import narrow_halo
-from trackmdp.solvers.solution import SearchProgress, Solution
+from trackmdp.solvers.solution import Solution
 from trackmdp.solvers.solve import run_solver, solve_group
 from trackmdp.solvers.value import value_of
 from trackmdp.training.display import make_console, reporting, table
@@ -45,7 +45,7 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem) -> float:
         check_sensors(world)
     if cfg.targets.count > 1:
         return _several(cfg, world, folder, console)
-    with reporting(console, f"solve {cfg.solver.name}", _progress) as show:
+    with reporting(console, f"solve {cfg.solver.name}") as show:
         solution = run_solver(world, cfg.solver, show, cfg.partition)
     bound = {name: float(each(world).mean()) for name, each in _BOUNDS.items()}
     arrays = write_sets(folder, solution.table, value=solution.value, upper_value=solution.bound)
@@ -61,19 +61,15 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem) -> float:
     if solution.interrupted:
         raise KeyboardInterrupt
     if cfg.verify:
-        from trackmdp.app.commands.verify import (
-            show_checks,
-            write_checks,
-        )  # loads the package `paper`
+        from trackmdp.app.commands.verify import verify_world  # loads the package `paper`
 
-        checks = write_checks(world, 1e-9, folder)
-        show_checks(console, checks, folder)
+        verify_world(world, 1e-9, folder, console)
     return solution.lower
 
 
 def _several(cfg: SolveConfig, world: World, folder: Path, at: Console) -> float:
     """Write `solution.json` and the sets of a single target; returns the AIHTR of separate trackers."""
-    with reporting(at, f"solve {cfg.solver.name}", _progress) as show:
+    with reporting(at, f"solve {cfg.solver.name}") as show:
         found = solve_group(Group([world] * cfg.targets.count), cfg.solver, show, cfg.partition)
     single, steps = found.singles[0], found.group.expected_steps
     arrays = write_sets(folder, single.table, value=single.value)
@@ -166,10 +162,3 @@ def _on_average(
     at.print(
         f"mixture: AIHTR {value:,.6f}, no policy with as few sensors has more than {upper:,.6f}"
     )
-
-
-def _progress(found: SearchProgress) -> str:
-    """How far the search is."""
-    bracket = f"bracket {found.lower:,.4f} ... {found.upper:,.4f}"
-    line = f"{found.seconds:.0f} s  {bracket}  {found.nodes:,} nodes"
-    return line if found.left is None else f"{line}  {found.stage}, {found.left:.0f} s left"

@@ -15,10 +15,9 @@ from trackmdp.training import notices
 from trackmdp.training.blocks import make_trainer
 from trackmdp.training.callbacks import Learning
 from trackmdp.training.display import make_console, show_held_out, table
-from trackmdp.training.folders import SUMMARY, finished
+from trackmdp.training.folders import SUMMARY, finished, locked
 from trackmdp.training.group_run import Several
 from trackmdp.training.inputs import problem_of
-from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
 from trackmdp.world.group import Subject
 
@@ -67,7 +66,7 @@ def _run(cfg: TrainConfig, folder: Path, problem: Subject | None) -> float:
         if getattr(cfg.cost, "safe", 0.0) is None:
             price = f"D = {recorded.safe_cost:,.6g}, the sum of all prices"
             console.print(f"cost.safe: {price}; set the price of finding a lost target")
-    trainer = make_trainer(problem, cfg, folder=folder, console=console)
+    trainer = make_trainer(problem, cfg, folder, console)
     done = complete(trainer)
     if done.several is not None:
         _show_several(console, cfg, done.several)

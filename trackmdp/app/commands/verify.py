@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from trackmdp.config import VerifyConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import RunError, UserError
 from trackmdp.paper import theorems
-from trackmdp.paper.check import Check, summarize_checks
+from trackmdp.paper.check import summarize_checks
 from trackmdp.solvers import hidden, optimal
 from trackmdp.training.display import make_console
 from trackmdp.world.model import World
@@ -35,55 +35,39 @@ def run(cfg: VerifyConfig, folder: Path, world: Problem) -> None:
         )
     known = modelled(world, "verify")
     check_sensors(known)
+    verify_world(known, cfg.tolerance, folder, console)
+
+
+def verify_world(world: World, tolerance: float, folder: Path, console: Console) -> None:
+    """Solve the world, with sensors of one cell, run every check, write `verification.json`, and show it.
+
+    Raises:
+        RunError: a claim fails.
+    """
     with console.status("checking the paper's theorems"):
-        checks = write_checks(known, cfg.tolerance, folder)
-    show_checks(console, checks, folder)
-
-
-def write_checks(world: World, tolerance: float, folder: Path) -> list[Check]:
-    """Solve the world, with sensors of one cell, run every check, and write `verification.json`."""
-    if world.modes > 1:
-        solution = optimal.solve(world) if world.tells_all else hidden.solve(world)
-        found = theorems.check_modes(world, solution, tolerance)
-    else:
-        solution = optimal.solve(world, nodes=NODES, tolerance=tolerance)
-        found = theorems.check_theorems(world, solution, tolerance)
+        if world.modes > 1:
+            solution = optimal.solve(world) if world.tells_all else hidden.solve(world)
+            found = theorems.check_modes(world, solution, tolerance)
+        else:
+            solution = optimal.solve(world, nodes=NODES, tolerance=tolerance)
+            found = theorems.check_theorems(world, solution, tolerance)
     if solution.interrupted:
         raise KeyboardInterrupt
     checks = [*found, *theorems.check_remarks(tolerance)]
-    content = {
-        "optimum": {
-            "lower": solution.lower,
-            "upper": solution.upper,
-            "certified": solution.certified,
-        },
-        "tolerance": tolerance,
-        "checks": [
-            check._asdict() | {"verdict": check.verdict, "passed": check.passed} for check in checks
-        ],
-    }
+    optimum = {name: getattr(solution, name) for name in ("lower", "upper", "certified")}
+    rows = [each._asdict() | {"verdict": each.verdict, "passed": each.passed} for each in checks]
+    content = {"optimum": optimum, "tolerance": tolerance, "checks": rows}
     write_json(folder / "verification.json", content)
-    return checks
-
-
-def show_checks(console: Console, checks: list[Check], folder: Path) -> None:
-    """The table of all checks, and how many claims hold.
-
-    Raises:
-        RunError: one fails.
-    """
-    shown = Table(title="the paper's theorems", title_justify="left")
-    shown.add_column("statement")
-    shown.add_column("deviation")
-    shown.add_column(
-        "verdict", max_width=13
-    )  # two lines of `not claimed; does not hold`, to leave room for statements
-    for check in checks:
-        note = f" ({check.note})" if check.note else ""
-        off = "–" if np.isneginf(check.deviation) else f"{check.deviation:.2g}"
-        shown.add_row(f"{check.name}: {check.statement}{note}", off, check.verdict)
+    # Two lines of `not claimed; does not hold`, to leave room for statements.
+    verdict = Column("verdict", max_width=13)
+    title = "the paper's theorems"
+    shown = Table("statement", "deviation", verdict, title=title, title_justify="left")
+    for each in checks:
+        note = f" ({each.note})" if each.note else ""
+        off = "–" if np.isneginf(each.deviation) else f"{each.deviation:.2g}"
+        shown.add_row(f"{each.name}: {each.statement}{note}", off, each.verdict)
     console.print(shown)
     summary = f"{summarize_checks(checks)}; results in {folder}"
     console.print(summary)
-    if not all(check.passed for check in checks):
+    if not all(each.passed for each in checks):
         raise RunError(summary)

@@ -10,17 +10,22 @@ import re
 import shlex
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
+from hydra.core.override_parser.types import OverrideType, ValueType
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.progress import track
 
-from trackmdp.app.sweep.configs import Configs
 from trackmdp.app.words import MOST, Compose, parsed, single_words
-from trackmdp.config import CommandConfig, TrainConfig, to_dict
-from trackmdp.config.resume import fixed_options, key_of
+from trackmdp.config import ROOTS, CommandConfig, TrainConfig, to_dict
+from trackmdp.config.checks import refuse_ignored
+from trackmdp.config.compose import composed_values, config_of
+from trackmdp.config.registry import unresolved
 from trackmdp.config.sweeping import BlocksConfig
+from trackmdp.config.tree import by_key, fixed_options, key_of
 from trackmdp.errors import UserError
 
 _T = TypeVar("_T")
@@ -126,6 +131,7 @@ def plan(
     grid: Sequence[Sequence[str]],
     naming: Collection[str] = (),
     console: Console | None = None,
+    concurrent: bool = False,
 ) -> list[Job]:
     """The jobs of a sweep, without duplicates.
 
@@ -139,6 +145,7 @@ def plan(
         grid: the words of each run.
         naming: options with values that name the folders; by default the ones that differ in the grid.
         console: where progress is shown.
+        concurrent: whether several of them run at once.
 
     Raises:
         UserError: words that do not make a config; a config that is refused is kept, as a job that fails.
@@ -164,25 +171,25 @@ def plan(
         # to one folder at once.
         jobs.setdefault(key, Job(command, sweep, name, tuple(words), cfg, refusal))
     return [
-        replace(job, label=f"{place}/{len(jobs)}") for place, job in enumerate(jobs.values(), 1)
+        replace(job, label=f"{place}/{len(jobs)}", concurrent=concurrent)
+        for place, job in enumerate(jobs.values(), 1)
     ]
 
 
 def sweep_name(command: str, words: Sequence[str], blocks: Sequence[str]) -> str:
     """The name of a sweep's folder: the same for the same words in any order; words with many values first."""
     told = _distinguishing(words)
-    experiments = [word.partition("=")[2] for word in told if key_of(word) == "experiment"]
     # Stable sort: False comes first, so that words with several values lead and survive the cut at 80 letters.
     text = _slug(
         sorted(told, key=lambda word: not parsed(word).is_sweep_override()),
-        experiments or [command],
+        [by_key(told).get("experiment", command)],
     )
     return f"{text}-{_digest(command, told, list(blocks))}"
 
 
 def _varying(grid: Sequence[Sequence[str]]) -> set[str]:
     """The options that differ between the runs of a grid, or are missing in some."""
-    runs = [{key_of(word): word for word in words} for words in grid]
+    runs = list(map(by_key, grid))
     keys = {key for run in runs for key in run}
     return {key for key in keys if len({run.get(key) for run in runs}) > 1}
 
@@ -195,11 +202,7 @@ def _folders(sweep: Path) -> dict[str, str]:
 
 def _slug(words: Iterable[str], prefix: Sequence[str] = ()) -> str:
     """Words as a readable part of a folder's name."""
-    named = {
-        key_of(word): _short(word.partition("=")[2])
-        for word in words
-        if key_of(word) not in _UNNAMED
-    }
+    named = {key: _short(text) for key, text in by_key(words).items() if key not in _UNNAMED}
     # `algo.gamma` is shown as `gamma`, unless another option of the runs ends alike.
     short = [key.split(".")[-1] for key in named]
     pairs = {
@@ -244,3 +247,51 @@ def _resumable(cfg: CommandConfig) -> CommandConfig:
             f"resume={cfg.resume}: expected null or auto in a sweep: its runs go on in their own folders"
         )
     return replace(cfg, resume="auto")
+
+
+class Configs:
+    """The checked configs of some lists of words.
+
+    Hydra takes a tenth of a second to compose, so that a composition is kept. In it the numbers of other words are put
+    in their places before interpolations are resolved, which may refer to them.
+
+    Args:
+        command: of the runs.
+        compose: the config of some words.
+    """
+
+    def __init__(self, command: str, compose: Compose) -> None:
+        self._root, self._compose = ROOTS[command], compose
+        self._composed: dict[tuple[str, ...], DictConfig] = {}
+
+    def __call__(self, words: Sequence[str]) -> tuple[CommandConfig | None, str]:
+        """The config of `words`, after every check that needs no file; or None and the reason of its refusal.
+
+        Raises:
+            UserError: the words make no config.
+        """
+        # ["algo=ppo", "seed=3"] -> ("algo=ppo", "seed")
+        form = tuple(next(iter(_number(word)), word) for word in words)
+        if form not in self._composed:
+            values = composed_values(self._compose(words), self._root)
+            self._composed[form] = unresolved(values)
+        composed = self._composed[form]
+        for word in words:
+            for key, number in _number(word).items():
+                OmegaConf.update(composed, key, number)
+        try:
+            cfg = config_of(composed, self._root)
+            if not getattr(cfg, "resume", None):  # a run that goes on has a config of its own
+                refuse_ignored(cfg, by_key(words))
+        except UserError as error:
+            return None, str(error)
+        return cfg, ""
+
+
+@cache  # of many runs the same; to read one takes as long as to fill a config
+def _number(word: str) -> dict[str, int | float]:
+    """The option that a word sets to a number; empty for other words."""
+    override = parsed(word)
+    plain = override.type is OverrideType.CHANGE and override.value_type is ValueType.ELEMENT
+    value = override.value() if plain else None
+    return {override.get_key_element(): value} if isinstance(value, (int, float)) else {}

@@ -52,15 +52,11 @@ _LOST = 255
 _TERMINATING = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 
 
-def run_in_process(job: Job, stop: Callable[[], int]) -> int:
+def run_in_process(job: Job) -> int:
     """Run `job` in a child process and wait for it; returns its exit status, -N where signal N killed it.
 
     The child leaves its result, or why it failed, in the run's folder. It also saves and stops when the calling process
     ends, even by SIGKILL.
-
-    Args:
-        job: the run.
-        stop: asked every 0.2 s: the number of the signal by which the run is to stop, 0 for none.
     """
     # The fork server is a process of its own, which the system may kill for lack of memory. The attempt that meets a
     # dead one fails, the next starts another; if that fails as well, something else is wrong.
@@ -72,13 +68,13 @@ def run_in_process(job: Job, stop: Callable[[], int]) -> int:
             if last:
                 _note(job, f"its process could not be started ({reason(error)})")
                 return FAILED
-    asked = 0
+    asked = False
     try:
         # The run outlives a killed fork server, which then cannot report how it ends; its own pipe closes when it does.
         while not wait([process.sentinel], _POLL) or (
             process.exitcode == _LOST and not ours.poll(_POLL)
         ):
-            if not asked and (asked := stop()):
+            if not asked and (asked := stop_signal(job.sweep) > 0):
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(process.pid, signal.SIGTERM)
     finally:
@@ -205,7 +201,7 @@ def run_job(job: Job) -> None:
     if job.cfg is None:
         fail(job, job.refusal, USER_MISTAKE)
         return
-    status = run_in_process(job, lambda: stop_signal(job.sweep))
+    status = run_in_process(job)
     run = run_of(job.folder)
     if run.state == "failed":
         _say(job, f"failed: {run.reason}")

@@ -16,8 +16,8 @@ from trackmdp.app.sweep.launchers import threads_of
 from trackmdp.app.sweep.plan import Job, progress
 from trackmdp.app.sweep.process import STOP, Launch, fail
 from trackmdp.config import TrainConfig
-from trackmdp.config.option_fields import is_number
-from trackmdp.config.resume import by_key, continued
+from trackmdp.config.options import is_number
+from trackmdp.config.tree import by_key, continued
 from trackmdp.durable import csv_text, write_text
 from trackmdp.errors import FAILED, USER_MISTAKE, Preempted, UserError
 from trackmdp.notebook.card import counted_words, decimal
@@ -29,11 +29,11 @@ from trackmdp.training.folders import (
     SUMMARY,
     RunState,
     finished,
+    locked,
     run_of,
     write_plan,
 )
-from trackmdp.training.lock import locked
-from trackmdp.untrusted import known_object, no_formula, reason
+from trackmdp.untrusted import no_formula, reason
 
 TABLE = "runs.csv"
 
@@ -217,11 +217,7 @@ def _cell(text: str | None) -> str | None:
 def status_of(runs: Sequence[RunState]) -> int:
     """The exit status: 0 if all is done, 2 if only mistakes of the user failed, else 1."""
     # A run that is neither done nor failed is nobody's mistake, and 2 means to a script: do not try again.
-    statuses = {
-        known_object(run.folder / FAILED_FILE).get("status") if run.state == "failed" else FAILED
-        for run in runs
-        if run.state != "done"
-    }
+    statuses = {run.result.get("status", FAILED) for run in runs if run.state != "done"}
     if not statuses:
         return 0
     return USER_MISTAKE if statuses == {USER_MISTAKE} else FAILED

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import optuna
 from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
@@ -124,7 +124,7 @@ def _distribution(override: Override) -> BaseDistribution:
         # A range may fall, range(8,0,-2); Optuna wants low to high.
         values = sorted(values_of(override))
         kind: Any = IntDistribution if isinstance(values[0], int) else FloatDistribution
-        return cast(BaseDistribution, kind(values[0], values[-1], step=abs(value.step)))
+        return kind(values[0], values[-1], step=abs(value.step))
     # As strings in Hydra's notation, since they become words: null, [1,2] and quoted text stay as they are.
     return CategoricalDistribution([word.partition("=")[2] for word in words])
 
@@ -137,20 +137,15 @@ def _ask(
     # after an interruption is the one that would have come without it. Failed ones count: else they would be drawn
     # again. 2^32: NumPy takes no larger seed.
     seed = derive(cfg.seed, "optuna", over, place) % 2**32
-    study.sampler = _sampler(cfg, seed)
-    try:
-        return cast(BaseTrial, study.ask(searched))
-    except ValueError as error:
-        raise UserError(f"{_OTHER} ({error})") from error
-
-
-def _sampler(cfg: OptunaConfig, seed: int) -> Any:
-    if cfg.sampler == "random":
-        return RandomSampler(seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ExperimentalWarning)
-        # Else a batch would be the same run many times.
-        return TPESampler(seed=seed, constant_liar=cfg.batch > 1)
+        # `constant_liar`: else a batch would be the same run many times.
+        tpe = TPESampler(seed=seed, constant_liar=cfg.batch > 1)
+    study.sampler = RandomSampler(seed) if cfg.sampler == "random" else tpe
+    try:
+        return study.ask(searched)
+    except ValueError as error:
+        raise UserError(f"{_OTHER} ({error})") from error
 
 
 def _tell(cfg: OptunaConfig, study: Any, trial: Any, job: Job) -> int:
@@ -213,4 +208,4 @@ def _enqueue_interrupted(study: Any) -> None:
 
 
 def _completed(study: Any) -> list[FrozenTrial]:
-    return cast(list[FrozenTrial], study.get_trials(deepcopy=False, states=[TrialState.COMPLETE]))
+    return study.get_trials(deepcopy=False, states=[TrialState.COMPLETE])
