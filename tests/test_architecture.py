@@ -55,6 +55,7 @@ ARROW = [
         "trackmdp.app.words",
         "trackmdp.app.prepare",
     ],
+    ["trackmdp.app.sources"],
     ["trackmdp.app.composer"],
     ["trackmdp.app.sweep"],
     ["trackmdp.app.launch"],

@@ -1,4 +1,4 @@
-"""From typed words to a composed config, by Hydra; a config is data, and names no code."""
+"""From typed words to a composed config, by Hydra's public calls; a config is data, and names no code."""
 
 from __future__ import annotations
 
@@ -9,23 +9,19 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
 
-from hydra import compose, version
-from hydra._internal.core_plugins.file_config_source import FileConfigSource
-from hydra._internal.hydra import Hydra
-from hydra._internal.utils import create_config_search_path
+from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
-from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig, OmegaConf
 
+from trackmdp.app.sources import searched
 from trackmdp.app.words import diagnose, refuse_deleted
 from trackmdp.config import GROUPS, ROOTS, conf_dir
 from trackmdp.config.registry import load_plugins, register_resolvers
 from trackmdp.config.sweeping import PLUGINS
 from trackmdp.errors import UserError
-from trackmdp.untrusted import parse_yaml, read_text
 
 _NO_LOGGING = {"version": 1, "root": None, "disable_existing_loggers": False}
 """`hydra/job_logging=none`; all others name classes and files."""
@@ -56,32 +52,12 @@ def register() -> None:
     for (group, name), schema in schemas.items():
         store.store(group=group or None, name=f"base_{name}", node=schema)
     # Hydra's plugins store launchers and sweepers of the same names, which ours replace: first load, then take out.
-    Plugins.instance().register(_UserFolder)
+    Plugins.instance()
     for part in PLUGINS:
         for name in GROUPS[f"hydra/{part}"]:
             # Where `hydra-joblib-launcher` is installed, Hydra would take the `hydra/launcher/joblib` that it stores
             # for the schema of our file of that name.
             store.repo["hydra"][part].pop(f"{name}.yaml", None)
-
-
-class _UserFolder(FileConfigSource):
-    """A folder of the user's: Hydra reads a file once it is YAML of limited size and depth."""
-
-    @staticmethod
-    def scheme() -> str:
-        """Stands before `://` and selects the class that reads a folder; "file" is Hydra's own."""
-        return "data"
-
-    def load_config(self, config_path: str) -> ConfigResult:
-        """The config at `config_path`, such as ``experiment/mine``.
-
-        Raises:
-            UserError: it is no YAML of plain data.
-        """
-        file = Path(self.path) / self._normalize_file_name(config_path)
-        if file.is_file():
-            parse_yaml(read_text(file, links=True), str(file))
-        return super().load_config(config_path)
 
 
 class Composer(ExitStack):
@@ -112,17 +88,16 @@ class Composer(ExitStack):
         self._folders = list(map(Path, folders))
 
     def __enter__(self) -> Self:
+        # Plugins of this package's are loaded by it, and their folders are searched as soon as Hydra is initialised.
         register()
-        # Hydra's state is a global of the process.
-        self.callback(GlobalHydra.instance().clear)
-        version.setbase("1.3")  # else Hydra warns, and behaves as its version 1.1
-        # As `hydra.initialize_config_dir` does it, with more folders: the first file of a name counts, schemas last.
-        path = create_config_search_path(conf_dir())
-        for folder in self._folders:
-            path.prepend("command-line", f"{_UserFolder.scheme()}://{folder.absolute()}", "schema")
-        for folder in load_plugins():
-            path.prepend("plugin", f"file://{folder.absolute()}", "schema")
-        Hydra.create_main_hydra2("trackmdp", path)
+        # Afterwards, as the last: Hydra's state is a global of the process, and closing restores the one from before.
+        self.callback(lambda: GlobalHydra.instance().clear())
+        self.enter_context(searched(self._folders, load_plugins()))
+        # Without `version_base` Hydra warns, and behaves as its version 1.1. An absolute folder works for a clone, an
+        # editable install and a wheel; a relative one works for a clone alone.
+        self.enter_context(
+            initialize_config_dir(conf_dir(), job_name="trackmdp", version_base="1.3")
+        )
         return self
 
     def __call__(self, words: Sequence[str]) -> DictConfig:

@@ -70,9 +70,16 @@ class Policy(TensorDictModuleBase, PolicyTable):
     in_keys: list[str] = list(STATE_KEYS)  # noqa: RUF012 (each policy may have its own)
     out_keys: ClassVar = ["action"]
 
-    def __init__(self, task: Task, sets: sparse.csr_array | None = None, **drawn: Any) -> None:
+    def __init__(
+        self,
+        task: Task,
+        sets: sparse.csr_array | None = None,
+        *,
+        probability: float | None = None,
+        k: int | None = None,
+    ) -> None:
         TensorDictModuleBase.__init__(self)
-        PolicyTable.__init__(self, task, sets, **drawn)
+        PolicyTable.__init__(self, task, sets, probability=probability, k=k)
         if task.keyed:
             self.in_keys = ["last_cell", "key", "steps_since_detection"]
         self.generator: torch.Generator | None = None
@@ -218,9 +225,17 @@ class Policy(TensorDictModuleBase, PolicyTable):
             action = Window.of(self.task, last_cell.device).to_local(last_cell, action)
         return tensordict.set("action", action)
 
-    def tracker(self, cell: int | None = None, **start: Any) -> Tracker:
-        """A tracker that follows one target with this policy from its detection on; arguments as of `Tracker`."""
-        return Tracker(self, cell, **start)
+    def tracker(
+        self,
+        cell: int | None = None,
+        *,
+        at: tuple[float, float] | None = None,
+        mode: int | None = None,
+        seed: int = 0,
+        world: Any = None,
+    ) -> Tracker:
+        """A tracker that follows one target with this policy from its detection in `cell` on; see `Tracker`."""
+        return Tracker(self, cell, at=at, mode=mode, seed=seed, world=world)
 
     # Files.
 
