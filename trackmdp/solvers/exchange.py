@@ -287,12 +287,17 @@ def _ranks(plans: Plans, step: int, plan: list[BoolArray], mass: Array) -> Index
     choice = plans.turns[step - 1].choice
     later = plans.after(plan[step - 1 :], step - 1)[0]
     gain = mass * (plans.detected[step - 1] - later)
-    margin = choice.margin(plan[step - 1], gain, plans.priced(step, mass))
+    price = plans.priced(step, mass)
+    change = np.abs(choice.changes(plan[step - 1], gain, price))
+    far = np.full_like(change, np.inf)
+    # Free sensors come last: no price would make them nearly worth leaving out.
+    with np.errstate(over="ignore"):  # a price near the least of all numbers: far away
+        margin = np.divide(change, price, out=far, where=price > 0)[:, 0]
     possible = choice.gained(mass)[:, 0] > 0
+    if choice.allowed is not None:
+        possible &= choice.allowed[:, 0]
     # Least margin first within each row, the impossible ones last.
     order = np.lexsort((margin, ~possible, choice.rows))
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.minimum(ranks(choice.rows), SINGLES)
-    if choice.allowed is not None:
-        possible &= choice.allowed[:, 0]
     return np.where(possible, rank, SINGLES)
