@@ -212,13 +212,13 @@ def test_of_new_plans_those_are_taken_that_gain_after_the_ones_before(
     every = np.ones(len(renewal.plans), dtype=bool)
     sets = exchange.exchange(plans, policy.sets, every)
     order = np.random.default_rng(0).permutation(len(renewal.plans))
-    order = order[search.rows_changed(plans.layout, policy.sets, sets)[order]]
+    order = order[search.rows_changed(plans.turns, policy.sets, sets)[order]]
     taken = search._gaining(policy, sets, order)
     assert 0 < len(taken) < len(order)
     now, rows = policy, np.zeros(len(renewal.plans), dtype=bool)
     for row in order:
         rows[row] = True
-        tried = Found(renewal, search.mixed(plans.layout, rows, sets, policy.sets))
+        tried = Found(renewal, search.mixed(plans.turns, rows, sets, policy.sets))
         assert (tried.aihtr > now.aihtr + policy.rounding) == (row in taken)
         rows[row] = row in taken
         now = tried if row in taken else now

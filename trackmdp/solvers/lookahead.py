@@ -69,7 +69,7 @@ def _first_set(problem: InnerProblem, mass: Array, states: IndexArray) -> BoolAr
     sets = first_guess(problem, known, mass)
     sets = exchange(problem.plans(mass), sets, np.ones(world.num_cells, dtype=bool))
     # One problem per located cell: its undetected mass after the sets carried out so far.
-    place = problem.layout.rows[0], states
+    place = problem.turns[0].before, states
     here = sparse.csr_array((mass, place), shape=(world.num_cells, world.num_cells))
     here.eliminate_zeros()
     tree = Tree(problem, known, problem.worth(sets, mass), _SLACK, here)

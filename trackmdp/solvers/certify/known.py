@@ -78,7 +78,7 @@ def adopted(
     if not better.any():
         return None
     found, mass = [], np.ones(problem.world.num_cells) if mass is None else mass
-    for turn, on, out in zip(problem.layout.turns, sets, left, strict=True):
+    for turn, on, out in zip(problem.turns, sets, left, strict=True):
         mass = mass @ turn.moves
         # A plan of the tree senses every possible cell but those left out.
         rows, cells = turn.choice.rows, turn.choice.sensors

@@ -54,7 +54,7 @@ def best_plans(
     for number in range(first.count):
         tried = first.of(number)
         earned, mass = _earned(plans, tried)
-        hopeful = earned + plans.layout.sums[plans.length - 1] @ (mass * revealed) > most
+        hopeful = earned + plans.turns[-1].starts @ (mass * revealed) > most
         if not hopeful.any():
             continue
         if not go_on(int(hopeful.sum())):
@@ -103,7 +103,7 @@ def _of_sensors(plans: Plans) -> _Choices | None:
     most = max(widths) if choices[0].budget is None else min(choices[0].budget, max(widths))
     counts = [sum(math.comb(width, k) for k in range(most + 1)) for width in widths]
     count = math.prod(counts)
-    if count > min(2**_MOST_BITS, _MOST_PATTERNS // plans.layout.count) or max(widths) > 62:
+    if count > min(2**_MOST_BITS, _MOST_PATTERNS // plans.count) or max(widths) > 62:
         return None
     each_set = [
         [
@@ -124,9 +124,9 @@ def _of_sensors(plans: Plans) -> _Choices | None:
         return found
 
     def of(number: int) -> _Tried:
-        each = sets(np.full(plans.layout.count, number))
+        each = sets(np.full(plans.count, number))
         report = [choice.report(on)[:, 0] for choice, on in zip(choices, each, strict=True)]
-        price = [(pay @ on)[:, 0] for pay, on in zip(plans.layout.pay, each, strict=False)]
+        price = [(turn.pay @ on)[:, 0] for turn, on in zip(plans.turns, each, strict=False)]
         return report, price
 
     return _Choices(count, of, sets)
@@ -137,7 +137,7 @@ def _of_patterns(plans: Plans, choice: Shared) -> _Choices | None:
     turn = plans.turns[0]
     number = ranks(turn.rows)
     bits = int(number.max(initial=0)) + 1
-    if plans.layout.count << bits > _MOST_PATTERNS:
+    if plans.count << bits > _MOST_PATTERNS:
         return None
     kept = choice.distinct(turn.price)
     cheapest = _cheapest(choice.some(kept), turn.price[kept], number, 2**bits)
@@ -177,13 +177,13 @@ def _cheapest(choice: Shared, price: Array, number: IndexArray, patterns: int) -
 
 def _earned(plans: Plans, tried: _Tried) -> tuple[Array, Array]:
     """`[K]` reward of the listed sets, and `[E]` the mass that they leave undetected."""
-    earned, mass = np.zeros(plans.layout.count), plans.mass[:, 0]
-    for t, (report, price) in enumerate(zip(*tried, strict=True), start=1):
-        now = plans.turns[t - 1].back @ mass
-        sums = plans.layout.sums[t]
-        inside = sums @ now
+    earned, mass = np.zeros(plans.count), plans.mass[:, 0]
+    steps = zip(plans.turns, plans.detected, *tried, strict=False)
+    for turn, detected, report, price in steps:
+        now = turn.back @ mass
+        inside = turn.sums @ now
         paid = np.where(inside > 0, price, 0.0) * inside  # an impossible set costs inf
-        earned += sums @ (now * report * plans.detected[t - 1][:, 0]) - paid
+        earned += turn.sums @ (now * report * detected[:, 0]) - paid
         mass = now * (1.0 - report)
     return earned, mass
 
@@ -191,11 +191,11 @@ def _earned(plans: Plans, tried: _Tried) -> tuple[Array, Array]:
 def _last(plans: Plans, mass: Array, hopeful: BoolArray) -> Array:
     """`[K]` the most that the best last set earns from `mass` `[E]`, of the rows that are `hopeful`."""
     turn, t = plans.turns[-1], plans.length
-    now = turn.back @ (mass * hopeful[plans.layout.rows[t - 1]])
+    now = turn.back @ (mass * hopeful[turn.before])
     missed = plans.missed[:, 0]
     gain = now * (plans.detected[t - 1][:, 0] - missed)
     price = plans.priced(t, now[:, None])[:, 0]
-    most: Array = plans.layout.sums[t] @ (now * missed)
+    most: Array = turn.sums @ (now * missed)
     return most + turn.choice.cover(gain, price, exact=True).upper
 
 
