@@ -15,6 +15,7 @@ from scipy import sparse
 
 from trackmdp.arrays.entries import per_row, row_index, with_data
 from trackmdp.arrays.types import AnyArray, Array
+from trackmdp.sensing.choose import TIE
 from trackmdp.sensing.decisions import Decisions, sensing
 from trackmdp.solvers.linear import RenewalSystem, accumulate
 from trackmdp.solvers.motion_totals import expected_steps, grid_of, still_to_come
@@ -238,8 +239,9 @@ def _reports_worth(world: World, table: Array, n: int) -> Array:
 def _best(world: World, table: Array, *, exact: bool) -> _Choices:
     """The best choices, one step ahead of `table`."""
     moves, price = _moves(world), _priced(world, world.stay_probability)
+    asked = price * (1.0 - TIE)  # rounding decides no tie
     found = [
-        moves.cover(_reports_worth(world, table, n), price, exact=exact)
+        moves.cover(_reports_worth(world, table, n), asked, exact=exact)
         for n in range(world.num_choices)
     ]
     paid = [per_row(moves.rows, each.on * price, world.num_states) for each in found]
