@@ -177,8 +177,8 @@ def test_saved_policies_keep_their_footprints(tmp_path: Path) -> None:
         (np.ones((2, 3)), "expected a row per sensor, 4 columns"),
         ([[1, 0, 0, 0], [0, 0, 0, 0]], "sensor 1 covers no cell"),
         ([[1.5, 0, 0, 0]], "0 and 1, or probabilities"),
-        ([["a"]], "expected a table of 0 and 1"),
-        (np.ones(4), "expected a table of 0 and 1"),
+        ([["a"]], "not a table of numbers"),
+        (np.ones(4), "expected a table, got shape"),
     ],
 )
 def test_what_are_no_footprints(given: object, said: str) -> None:

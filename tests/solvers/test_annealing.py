@@ -65,7 +65,7 @@ def test_an_advantage_is_what_a_chance_gains_a_visit(kind: str) -> None:
     advantages, now = plans.advantages(chances, 0.0), plans.mass
     for t, (turn, chance) in enumerate(zip(plans.turns, chances, strict=True), start=1):
         now = turn.back @ now
-        come = (plans.layout.sums[t] @ now)[turn.choice.rows, 0]
+        come = (turn.sums @ now)[turn.choice.rows, 0]
         place = int(np.argmax(come))
         rise = 0.0
         for sign in (1.0, -1.0):

@@ -40,8 +40,8 @@ def test_no_cells_value_falls_from_whatever_sets_it_starts(world: World, seed: i
     renewal, mass = Renewal(world, world.motion), rng.random(9)
     problem = InnerProblem.of(renewal, before)
     plans, sets = problem.plans(mass), renewal.sets(start)
-    worth = problem.worth(sets, mass)
-    found = problem.worth(exchange.exchange(plans, sets, np.ones(9, dtype=bool)), mass)
+    worth = plans.worth_of(sets)
+    found = plans.worth_of(exchange.exchange(plans, sets, np.ones(9, dtype=bool)))
     assert (found >= worth - 1e-9 * (1.0 + np.abs(worth))).all()
 
 
@@ -113,7 +113,9 @@ def test_one_or_two_cells_are_left_for_the_next_set(
     ]
     assert [on.sum() for on in stuck] == [len(first), len(then)]
     found = exchange.exchange(problem.plans(), sets, np.ones(9, dtype=bool))
-    assert problem.worth(found)[0] == pytest.approx(0.5 - 0.6 + 0.999 * 0.5 * 0.4, abs=1e-12)
+    assert problem.plans().worth_of(found)[0] == pytest.approx(
+        0.5 - 0.6 + 0.999 * 0.5 * 0.4, abs=1e-12
+    )
 
 
 @pytest.mark.parametrize(
@@ -212,13 +214,13 @@ def test_of_new_plans_those_are_taken_that_gain_after_the_ones_before(
     every = np.ones(len(renewal.plans), dtype=bool)
     sets = exchange.exchange(plans, policy.sets, every)
     order = np.random.default_rng(0).permutation(len(renewal.plans))
-    order = order[search.rows_changed(plans.layout, policy.sets, sets)[order]]
+    order = order[search.rows_changed(plans.turns, policy.sets, sets)[order]]
     taken = search._gaining(policy, sets, order)
     assert 0 < len(taken) < len(order)
     now, rows = policy, np.zeros(len(renewal.plans), dtype=bool)
     for row in order:
         rows[row] = True
-        tried = Found(renewal, search.mixed(plans.layout, rows, sets, policy.sets))
+        tried = Found(renewal, search.mixed(plans.turns, rows, sets, policy.sets))
         assert (tried.aihtr > now.aihtr + policy.rounding) == (row in taken)
         rows[row] = row in taken
         now = tried if row in taken else now

@@ -53,7 +53,7 @@ def best_of_all(group: Group) -> float:
         if np.abs(after - value).max() < 1e-11 or step == group.task.max_steps:
             break
         value = after
-    return float(after[: chain.starts].mean())
+    return float(after[: group.task.num_cells ** len(group)].mean())
 
 
 def check_bracket(group: Group) -> None:

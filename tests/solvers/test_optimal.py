@@ -85,10 +85,10 @@ def test_the_search_ends_where_no_single_set_can_be_improved(world: World) -> No
     sets = renewal.sets(table)
     np.testing.assert_array_equal(renewal.table(sets).dense(), table.dense())
     problem = InnerProblem.of(renewal, value)
-    worth = problem.worth(sets)
+    worth = problem.plans().worth_of(sets)
     np.testing.assert_allclose(worth, value, rtol=1e-9, atol=1e-9)
     ascended = problem.plans().ascend(sets, sweeps=1)
-    np.testing.assert_allclose(problem.worth(ascended), worth, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(problem.plans().worth_of(ascended), worth, rtol=1e-9, atol=1e-9)
 
 
 def test_the_homotopy_finds_sets_that_have_to_change_together() -> None:

@@ -88,7 +88,7 @@ def test_what_is_proved_of_a_plan_holds_for_each_cell() -> None:
     )
     # One step of policy iteration gains no more than is proved, at no cell, and closes it where trees are closed.
     renewal = Renewal(world, world.motion)
-    gained = InnerProblem.of(renewal, value).worth(renewal.sets(better)) - value
+    gained = InnerProblem.of(renewal, value).plans().worth_of(renewal.sets(better)) - value
     assert short.max() > 1e-3
     np.testing.assert_allclose(gained, short, rtol=0, atol=1e-7)
 

@@ -73,17 +73,17 @@ class _Paths:
             self._steps.append((ways.rows, end))
             if len(ways.turns) < task.num_choices:
                 ways.choose(self._last, task.keys.cell(end))
-        self._layout = ways.layout()
+        self._turns = ways.turns
 
     def plans(self, value: Array) -> Plans:
         """The plans of all keys, V `[keys]` given."""
         *detected, missed = (self._task.reward + value[end] for _, end in self._steps)
         missed = self._last @ (missed - self._task.safe_cost)
-        return Plans(self._layout, np.ones(self._count), detected, missed)
+        return Plans(self._turns, np.ones(self._count), detected, missed)
 
     def sets(self, policy: PolicyTable) -> list[BoolArray]:
         """Its decisions here, `[G, 1]` for each free choice."""
-        choices = (turn.choice for turn in self._layout.turns)
+        choices = (turn.choice for turn in self._turns)
         return [
             policy.chosen(n, each.rows, each.sensors)[:, None] > 0 for n, each in enumerate(choices)
         ]

@@ -13,7 +13,7 @@ from trackmdp.arrays.entries import per_row
 from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.sensing.decisions import sensing
 from trackmdp.sensing.task import Task
-from trackmdp.solvers.plans import Layout, Turn
+from trackmdp.solvers.plans import Turn
 
 
 class Ways:
@@ -65,9 +65,5 @@ class Ways:
         """The last move is followed by a free choice, the target then being in `cells` `[E]`."""
         choice = sensing(self._task, self.rows, cells, len(self._located), self._located)
         price = self._task.prices[choice.sensors]
-        self.turns.append(Turn(self.rows, moves, moves.sum(axis=1), choice, price))
-
-    def layout(self) -> Layout:
-        """Entries and decisions of the plans of all rows."""
-        count = len(self._located)
-        return Layout(np.arange(count), self.turns, count)
+        before = self.turns[-1].rows if self.turns else np.arange(len(self._located))
+        self.turns.append(Turn(before, self.rows, moves, moves.sum(axis=1), choice, price))

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from trackmdp.arrays.entries import short_indices
 from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.config.sensors import LARGEST_PRICE
 from trackmdp.errors import UserError
@@ -37,6 +38,30 @@ def array_of(source: str, given: Any) -> Any:
         return given if sparse.issparse(given) else np.asarray(given)
     except ValueError:
         raise UserError(f"{source}: rows of different lengths, expected a table") from None
+
+
+def canonical(source: str, given: Any) -> sparse.csr_array:
+    """A table, sparse or dense, as CSR of float64 with sorted indices, no duplicates and no explicit zeros.
+
+    Raises:
+        UserError: it is no table of real numbers, or its indices lead out of it; `source` is named at the start.
+    """
+    table = array_of(source, given)
+    # bool, signed, unsigned, float: complex numbers would lose their imaginary part below.
+    if table.dtype.kind not in "biuf":
+        raise UserError(f"{source}: not a table of numbers (but of {table.dtype})")
+    if table.ndim != 2:
+        raise UserError(f"{source}: expected a table, got shape {table.shape}")
+    found = sparse.csr_array(table, dtype=np.float64, copy=True)
+    try:
+        found.check_format(
+            full_check=True
+        )  # SciPy reads outside its memory where an index is wrong
+    except ValueError as error:
+        raise UserError(f"{source}: not a sparse matrix ({error})") from None
+    found.sum_duplicates()
+    found.eliminate_zeros()
+    return short_indices(found)
 
 
 def one_each(

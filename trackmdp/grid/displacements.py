@@ -13,6 +13,11 @@ def displacement(columns: int, start: Any, end: Any) -> tuple[Any, Any]:
     return end // columns - start // columns, end % columns - start % columns
 
 
+def window_offsets(radius: int) -> npt.NDArray[np.int64]:
+    """`[(2·radius+1)², 2]` offsets (row, column) of a square window, row by row."""
+    return np.indices((2 * radius + 1, 2 * radius + 1)).reshape(2, -1).T - radius
+
+
 def apart(columns: int, start: npt.NDArray[Any], end: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """How far cells lie apart, in rows or in columns, whichever is more."""
     down, across = displacement(columns, start, end)

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order
 
-from trackmdp.arrays.entries import ones_at, row_index, row_sums, short_indices
-from trackmdp.arrays.numbers import array_of
+from trackmdp.arrays.entries import ones_at, row_index, row_sums
+from trackmdp.arrays.numbers import canonical
 from trackmdp.errors import UserError
 
 
@@ -21,22 +21,10 @@ def canonical_kernel(kernel: Any, source: str = "kernel") -> sparse.csr_array:
         UserError: it is no square table of real numbers, or its indices lead out of it; `source` is named at the start
             of the message.
     """
-    table = array_of(source, kernel)
-    # bool, signed, unsigned, float: complex numbers would lose their imaginary part below.
-    if table.dtype.kind not in "biuf":
-        raise UserError(f"{source}: not a table of numbers (but of {table.dtype})")
-    if table.ndim != 2 or table.shape[0] != table.shape[1]:
+    table = canonical(source, kernel)
+    if table.shape[0] != table.shape[1]:
         raise UserError(f"{source}: expected a square table, got shape {table.shape}")
-    canonical = sparse.csr_array(table, dtype=np.float64, copy=True)
-    try:
-        canonical.check_format(
-            full_check=True
-        )  # SciPy reads outside its memory where an index is wrong
-    except ValueError as error:
-        raise UserError(f"{source}: not a sparse matrix ({error})") from None
-    canonical.sum_duplicates()
-    canonical.eliminate_zeros()
-    return short_indices(canonical)
+    return table
 
 
 def check_kernel(

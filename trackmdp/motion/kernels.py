@@ -16,7 +16,7 @@ from scipy import sparse
 from trackmdp.arrays.entries import ones_at, row_sums
 from trackmdp.arrays.files import read_matrix
 from trackmdp.arrays.types import Array, BoolArray, Indices
-from trackmdp.grid.displacements import cell_at
+from trackmdp.grid.displacements import cell_at, window_offsets
 from trackmdp.grid.size import Size, grid_size
 from trackmdp.motion.kernel_checks import canonical_kernel
 
@@ -43,7 +43,7 @@ def random_support(
     One position has `low_probability`, the others share the rest equally; the target exits with `exit_probability`.
     With a single position left, that one has all of 1 - exit_probability.
     """
-    grid, window, rng = grid_size(size), _window(radius), np.random.default_rng(seed)
+    grid, window, rng = grid_size(size), window_offsets(radius), np.random.default_rng(seed)
     lows = [
         _one_low(count, low_probability, exit_probability) for count in range(1, support_size + 1)
     ]
@@ -77,7 +77,7 @@ def random_walk(
     size: Size, *, stay: float, diagonal: bool, exit_probability: float, border: Border
 ) -> sparse.csr_array:
     """A lazy random walk: stay with probability `stay`, else one of the 4 (or, with `diagonal`, 8) neighbours."""
-    window = _window(1)
+    window = window_offsets(1)
     distance = np.abs(window).sum(axis=1)
     moves = (distance > 0) & ((distance == 1) | diagonal)
     weights = np.where(distance == 0, stay, (1.0 - stay) * moves / moves.sum())
@@ -93,7 +93,7 @@ def drift(
     the eight neighbours is shared between them in proportion to the angle, so the mean heading is as asked. Row 0 is
     the top one, as in all pictures.
     """
-    window = _window(1)
+    window = window_offsets(1)
     weights = np.full(len(window), (1.0 - persistence) / len(window))
     # 30 degrees is 2/3 of the way from right (0) to up-right (45): those get 1/3 and 2/3. Rows count downwards, so up
     # is -sin.
@@ -115,12 +115,6 @@ def load_table(size: Size, *, path: str | Path) -> sparse.csr_array:  # noqa: AR
         UserError: there is no such file, or it holds no square table of numbers.
     """
     return canonical_kernel(read_matrix("kernel.path", path, name="kernel"), f"kernel.path={path}")
-
-
-def _window(radius: int) -> _Offsets:
-    """`[(2·radius+1)², 2]` offsets (row, column), row by row."""
-    steps = np.arange(-radius, radius + 1)
-    return np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 def _blocks(grid: tuple[int, int]) -> list[_Offsets]:

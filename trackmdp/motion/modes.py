@@ -28,7 +28,7 @@ from scipy.special import ndtr
 from trackmdp.arrays.types import Array, Indices
 from trackmdp.config.options import GROUPS
 from trackmdp.config.registry import make
-from trackmdp.grid.displacements import cell_at
+from trackmdp.grid.displacements import cell_at, window_offsets
 from trackmdp.grid.size import Size, grid_size
 from trackmdp.motion.kernel_checks import canonical_kernel, check_kernel
 
@@ -193,7 +193,10 @@ def _turning(
     exit_probability: float,
 ) -> tuple[sparse.csr_array, int]:
     """The kernel of turns at `rates` `[T]`, degrees/s, with the probability `change` `[T, T]` of each next one."""
-    velocity, turns = _velocities(speed, spacing), len(rates)
+    most = math.floor(speed / spacing * (1 + 1e-12))
+    # [V, 2] m/s along rows (downwards) and columns, in order
+    velocity = spacing * window_offsets(most).astype(np.float64)
+    turns = len(rates)
     switch = np.zeros((len(velocity), turns, len(velocity), turns))
     for turn, rate in enumerate(rates.tolist()):
         sine, cosine = math.sin(math.radians(rate * step)), math.cos(math.radians(rate * step))
@@ -234,13 +237,6 @@ def steps_of(displacement: Array) -> tuple[Indices, Array]:
     up = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
     chance = np.where(up > 0, part[:, None], 1.0 - part[:, None])
     return (low[:, None] + up).astype(np.int64), chance.prod(axis=-1)
-
-
-def _velocities(speed: float, spacing: float) -> Array:
-    """`[V, 2]` m/s along rows (downwards) and columns, each a multiple of `spacing`, in order."""
-    most = math.floor(speed / spacing * (1 + 1e-12))
-    levels = spacing * np.arange(-most, most + 1)
-    return np.stack(np.meshgrid(levels, levels, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 def _changes(mean: Array, velocity: Array, spacing: float, deviation: float) -> Array:

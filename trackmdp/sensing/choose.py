@@ -38,6 +38,21 @@ def largest(rows: IndexArray, net: Array, count: int) -> BoolArray:
     return rank < count
 
 
+@dataclass(frozen=True)
+class Cover:
+    """Best sets of all rows, or solutions of linear programs that stand for them.
+
+    Attributes:
+        on: `[G]`, whether each decision is on; of linear programs its share.
+        seen: `[E]`, probability of a report at each entry.
+        upper: `[K]`, proved: no set of the row gains more.
+    """
+
+    on: AnyArray
+    seen: AnyArray
+    upper: Array
+
+
 @dataclass(frozen=True, eq=False)
 class Own:
     """Each entry is seen by the sensor of its own cell.
@@ -84,11 +99,6 @@ class Own:
         allowed = task.choosable(None if located is None else located[rows], cells)
         allowed = None if allowed is None else allowed[:, None]
         return cls(rows, cells, count, group, chance, allowed, task.budget)
-
-    def within(self, on: BoolArray, net: Array) -> BoolArray:
-        """`[G, C]`, of the sets `on` as many sensors as the budget allows, those of the largest `net` `[G, C]`."""
-        assert self.budget is not None
-        return on & largest(self.rows, np.where(on, net, -np.inf), self.budget)
 
     def report(self, on: AnyArray) -> AnyArray:
         """`[E, C]` probability that the set `on` `[G, C]` reports a target there; bool where no sensor misses.
@@ -151,21 +161,19 @@ class Own:
         gained = self.gained(gain)
         chosen: BoolArray = gained > price
         chosen = chosen if self.allowed is None else chosen & self.allowed
-        return chosen if self.budget is None else self.within(chosen, gained - price)
-
-    def upper(self, gain: Array, price: Array, *, exact: bool = True) -> Array:  # noqa: ARG002
-        """`[K]`, proved: no set of a row gains more, of `gain` `[E]` and prices `[G]`; tighter if `exact`."""
-        net = np.maximum(self.gained(gain[:, None])[:, 0] - price, 0.0)
-        net = net if self.allowed is None else net * self.allowed[:, 0]
         if self.budget is not None:
-            net = net * self.within((net > 0)[:, None], net[:, None])[:, 0]
-        return per_row(self.rows, net, self.count)
+            net = np.where(chosen, gained - price, -np.inf)
+            chosen &= largest(self.rows, net, self.budget)
+        return chosen
 
-    def margin(self, on: BoolArray, gain: Array, price: Array) -> Array:  # noqa: ARG002
-        """`[G]` distance of each decision from its threshold, relative to its price; inf where none can be."""
-        gained = self.gained(gain)
-        far = np.full_like(gained, np.inf)
-        # Free sensors come last: no price would make them nearly worth leaving out.
-        with np.errstate(over="ignore"):  # a price near the least of all numbers: far away
-            away = np.divide(np.abs(gained - price), price, out=far, where=price > 0)
-        return (away if self.allowed is None else np.where(self.allowed, away, np.inf))[:, 0]
+    def cover(self, gain: Array, price: Array, *, exact: bool = False) -> Cover:  # noqa: ARG002
+        """The best sets, and what they gain, of `gain` `[E]` and prices `[G]`; `exact`: sets, not shares."""
+        on = self.best(gain[:, None], price[:, None])
+        net = (self.gained(gain[:, None]) - price[:, None]) * on
+        upper = per_row(self.rows, net[:, 0], self.count)
+        return Cover(on[:, 0], self.report(on)[:, 0], upper)
+
+    def changes(self, on: BoolArray, gain: Array, price: Array) -> Array:
+        """`[G, C]` gain of switching each sensor over, all others as they are."""
+        net = self.gained(gain) - price
+        return np.where(on, -net, net)

@@ -29,7 +29,7 @@ from scipy import sparse
 from trackmdp.arrays.entries import per_row, ranks, row_index, summing, with_data
 from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
-from trackmdp.sensing.choose import TIE
+from trackmdp.sensing.choose import TIE, Cover
 from trackmdp.sensing.programs import PROVED, integer, relaxed
 from trackmdp.sensing.task import Task
 
@@ -39,21 +39,6 @@ _MOST = 2**26
 """Sensors that see the entries of a step, entry by entry: some 5 GB."""
 _CERTAIN = 1.0 - 2.0**-53
 """Stands for a probability of 1 where its logarithm is needed; all that is left of an entry then is 1e-16."""
-
-
-@dataclass(frozen=True)
-class Cover:
-    """Solutions of the linear programs of all rows.
-
-    Attributes:
-        on: `[G]`, share of each decision.
-        seen: `[E]`, share of each entry that is reported.
-        upper: `[K]`, proved: no set of the row gains more.
-    """
-
-    on: Array
-    seen: Array
-    upper: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,19 +147,9 @@ class Shared:
         return summing(self.rows, self.count)
 
     def changes(self, on: BoolArray, gain: Array, price: Array) -> Array:
-        """`[G, C]` gain of switching each sensor over, all others as they are."""
+        """See `Own`."""
         left = gain * self._unreported(on)
         return np.where(on, price - self._odds @ left, self.sees @ left - price)
-
-    def upper(self, gain: Array, price: Array, *, exact: bool = True) -> Array:
-        """See `Own`; if `exact`, by integer programs where no sensor misses."""
-        return self.cover(gain, price, exact=exact).upper
-
-    def margin(self, on: BoolArray, gain: Array, price: Array) -> Array:
-        """See `Own`."""
-        change = np.abs(self.changes(on, gain, price))
-        far = np.full_like(change, np.inf)
-        return np.divide(change, price, out=far, where=price > 0)[:, 0]
 
     def best(
         self, gain: Array, price: Array, on: BoolArray | None = None, *, exact: bool = False

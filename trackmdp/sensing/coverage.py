@@ -26,9 +26,9 @@ import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.arrays.entries import ones_at, row_index
-from trackmdp.arrays.numbers import array_of
+from trackmdp.arrays.numbers import canonical
 from trackmdp.errors import UserError
-from trackmdp.grid.displacements import cell_at
+from trackmdp.grid.displacements import cell_at, window_offsets
 from trackmdp.machine import check_free
 
 
@@ -52,8 +52,10 @@ class Coverage:
         """
         if given is None:
             return None
-        matrix = given.matrix if isinstance(given, Coverage) else _canonical(given)
-        if len(matrix.shape) != 2 or matrix.shape[1] != cells or not matrix.shape[0]:
+        matrix = given.matrix if isinstance(given, Coverage) else canonical("coverage", given)
+        if not ((matrix.data > 0) & (matrix.data <= 1)).all():
+            raise UserError("coverage: expected 0 and 1, or probabilities of a report")
+        if matrix.shape[1] != cells or not matrix.shape[0]:
             shape = " x ".join(map(str, matrix.shape))
             raise UserError(
                 f"coverage: a table of {shape}, expected a row per sensor, {cells} columns"
@@ -190,30 +192,10 @@ def discs(
         radius, rows + columns
     )  # a larger one sees no more of the grid, and its square may be no number
     far = int(min(radius, max(rows, columns)))
-    reach = np.arange(-far, far + 1)
-    down, across = (each.ravel() for each in np.meshgrid(reach, reach, indexing="ij"))
+    down, across = window_offsets(far).T
     near = down**2 + across**2 <= radius**2
     # Measured: 30 bytes for each place of a disc, in the grid or not.
     check_free(f"sensor.radius={radius}", 30 * len(positions) * int(near.sum()))
     # [S, offsets] each: every sensor's disc, and which of its cells lie in the grid.
     cell, inside = cell_at(size, positions[:, :1] + down[near], positions[:, 1:] + across[near])
     return ones_at(np.nonzero(inside)[0], cell[inside], (len(positions), rows * columns))
-
-
-def _canonical(given: Any) -> sparse.csr_array:
-    """A table of any kind as CSR of float64, sorted and without explicit zeros.
-
-    Raises:
-        UserError: an entry is no probability.
-    """
-    table = array_of("coverage", given)
-    if len(table.shape) != 2 or table.dtype.kind not in "biuf":
-        raise UserError(
-            f"coverage: {table.dtype} of shape {tuple(table.shape)}, expected a table of 0 and 1"
-        )
-    matrix = sparse.csr_array(table, dtype=np.float64, copy=True)
-    matrix.sum_duplicates()
-    if not ((matrix.data >= 0) & (matrix.data <= 1)).all():
-        raise UserError("coverage: expected 0 and 1, or probabilities of a report")
-    matrix.eliminate_zeros()
-    return matrix

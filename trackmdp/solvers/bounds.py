@@ -14,9 +14,8 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.arrays.entries import per_row, row_index, with_data
-from trackmdp.arrays.types import AnyArray, Array, BoolArray
-from trackmdp.sensing.choose import Own
-from trackmdp.sensing.cover import Shared
+from trackmdp.arrays.types import AnyArray, Array
+from trackmdp.sensing.choose import TIE
 from trackmdp.sensing.decisions import Decisions, sensing
 from trackmdp.solvers.linear import RenewalSystem, accumulate
 from trackmdp.solvers.motion_totals import expected_steps, grid_of, still_to_come
@@ -129,7 +128,7 @@ def _moves(world: World) -> Decisions:
 
 def _free(world: World, gain: Array, charge: Array, *, exact: bool = False) -> Array:
     """`[Z]` the most that one free choice gains, of `gain` `[E]` for each move and prices times `charge` `[Z]`."""
-    return _moves(world).upper(gain, _priced(world, charge), exact=exact)
+    return _moves(world).cover(gain, _priced(world, charge), exact=exact).upper
 
 
 def _priced(world: World, charge: Array) -> Array:
@@ -186,24 +185,20 @@ class _Choices:
         paid: `[Z, t_max + 1]`, expected prices.
     """
 
-    on: Array | BoolArray
-    report: Array | BoolArray
+    on: AnyArray
+    report: AnyArray
     paid: Array
-
-    def same_as(self, other: _Choices) -> bool:
-        """Whether the same is sensed, at the same price: other sensors may see the same cells."""
-        same = bool((self.report == other.report).all())
-        return same and (self.on is other.on or bool((self.paid == other.paid).all()))
 
 
 def _clocked(world: World, *, exact: bool) -> ClockedBound:
     """U(z, n) by policy iteration."""
-    # All on is a policy of finite value; from there each round is worth more, and there are finitely many policies.
-    choices = _all_on(world)
+    # Any policy has a finite value; from there each round is worth more, and there are finitely many policies.
+    choices = _best(world, np.zeros((world.num_states, world.num_choices + 1)), exact=exact)
     table, solved = _value(world, choices)
     while True:
-        improved = _improved(world, table, choices, exact=exact)
-        if improved.same_as(choices):
+        improved = _best(world, table, exact=exact)
+        # Other sensors may see the same cells.
+        if (improved.report == choices.report).all() and (improved.paid == choices.paid).all():
             break
         candidate, solved = _value(world, improved, table)
         # Only rounding is left to gain; of the last column, where D may be any number, it would be the most.
@@ -230,24 +225,9 @@ def _left_by_ties(world: World, table: Array, choices: _Choices) -> float:
     for n in range(world.num_choices):
         worth = _reports_worth(world, table, n)
         net = (moves.gained(worth[:, None])[:, 0] - price) * choices.on[:, n]
-        most = moves.upper(worth, price)
+        most = moves.cover(worth, price).upper
         left.append(float((most - per_row(moves.rows, net, world.num_states)).max()))
     return max(left)
-
-
-def _chosen(world: World, on: Array | BoolArray, report: Array | BoolArray) -> _Choices:
-    rows, paid = _moves(world).rows, on * _priced(world, world.stay_probability)[:, None]
-    sums = [per_row(rows, each, world.num_states) for each in paid.T]
-    return _Choices(on, report, np.stack(sums, axis=1))
-
-
-def _all_on(world: World) -> _Choices:
-    moves = _moves(world)
-    shape = (len(moves.rows), world.num_choices)
-    on = np.ones(shape, dtype=bool) & world.available[moves.sensors, None]
-    if isinstance(moves, Own) and moves.budget is not None:
-        on = moves.within(on, np.zeros(shape))
-    return _chosen(world, on, moves.report(on))
 
 
 def _reports_worth(world: World, table: Array, n: int) -> Array:
@@ -256,33 +236,17 @@ def _reports_worth(world: World, table: Array, n: int) -> Array:
     return world.kernel.data * over_miss[world.kernel.indices]
 
 
-def _improved(world: World, table: Array, choices: _Choices, *, exact: bool) -> _Choices:
-    """The best choices, one step ahead; a tie leaves the present one."""
-    moves, free = _moves(world), range(world.num_choices)
-    price = _priced(world, world.stay_probability)[:, None]
-    if isinstance(moves, Shared):
-        found = [
-            moves.cover(_reports_worth(world, table, n), price[:, 0], exact=exact) for n in free
-        ]
-        on, seen = (
-            np.stack([getattr(each, name) for each in found], axis=1) for name in ("on", "seen")
-        )
-        return _chosen(world, on, seen)
-    # Both sides of the comparison are multiplied by the probability p of the move; a target missed by a sensor that is
-    # on is worth p (1 - p_d) U(j, n + 1) on both: it is on iff p p_d (r + U(j, 0) - U(j, n + 1)) > c p_in.
-    on = np.zeros(choices.on.shape, dtype=bool)
-    for n in free:
-        worth = _reports_worth(world, table, n)[:, None]
-        gain = moves.gained(worth) - price
-        # Without a margin, rounding could switch a tied choice to and fro for ever. It is that of the numbers compared:
-        # beside a large D in the last column no gain would count.
-        tie = 1e-12 * (1.0 + np.abs(table[:, 0]).max() + moves.gained(np.abs(worth)))
-        before = choices.on[:, n : n + 1]
-        chosen = np.where(np.abs(gain) <= tie, before, gain > 0)
-        if moves.budget is not None:
-            chosen = moves.within(chosen, gain + tie * before)
-        on[:, n] = chosen[:, 0]
-    return _chosen(world, on, moves.report(on))
+def _best(world: World, table: Array, *, exact: bool) -> _Choices:
+    """The best choices, one step ahead of `table`."""
+    moves, price = _moves(world), _priced(world, world.stay_probability)
+    asked = price * (1.0 - TIE)  # rounding decides no tie
+    found = [
+        moves.cover(_reports_worth(world, table, n), asked, exact=exact)
+        for n in range(world.num_choices)
+    ]
+    paid = [per_row(moves.rows, each.on * price, world.num_states) for each in found]
+    columns = [each.on for each in found], [each.seen for each in found], paid
+    return _Choices(*(np.stack(each, axis=1) for each in columns))
 
 
 def _one_step(world: World, table: Array, *, exact: bool = False) -> Array:

@@ -15,6 +15,7 @@ import numpy as np
 
 from trackmdp.arrays.types import IndexArray, Indices
 from trackmdp.memory.keys import KeySpace
+from trackmdp.motion.chain import Motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +58,13 @@ def detected_codes(keys: KeySpace, key: IndexArray, state: IndexArray) -> Indice
     return state.astype(np.int64) * keys.num_keys + key
 
 
-def forced_codes(keys: KeySpace, states: int, key: IndexArray | None, state: IndexArray) -> Indices:
-    """`[E]`, see `Events`; what the next key does not depend on counts as 0, without `key` all of it."""
-    if key is not None and keys.order == 1:  # the next one depends on the last located cell alone
-        key = keys.start(keys.cell(key))
-    return (state.astype(np.int64) + states) * keys.num_keys + (0 if key is None else key)
+def started(keys: KeySpace, motion: Motion, state: IndexArray) -> Indices:
+    """`[E]` codes of detections in these states at an episode's start."""
+    return detected_codes(keys, keys.start(motion.cell[state], state % motion.modes), state)
+
+
+def forced_codes(keys: KeySpace, states: int, key: IndexArray, state: IndexArray) -> Indices:
+    """`[E]`, see `Events`; what the next key does not depend on counts as 0."""
+    if keys.order < 2:  # the next one depends on the last located cell at most
+        key = keys.start(keys.cell(key)) if keys.order else 0 * key
+    return detected_codes(keys, key, state.astype(np.int64) + states)

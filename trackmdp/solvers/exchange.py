@@ -28,7 +28,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers.bounds import one_set
 from trackmdp.solvers.motion_totals import forced_worth
-from trackmdp.solvers.plans import Layout, Plans, Turn
+from trackmdp.solvers.plans import Plans, Turn
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import (
     Found,
@@ -118,10 +118,10 @@ def best_of(
         plans = policy.plans()
         after = plans.ascend(other, sweeps=10)
         # Where these are the plans at hand, exchange has been tried.
-        tried = exchange(plans, after, rows_changed(plans.layout, policy.sets, after), go_on)
+        tried = exchange(plans, after, rows_changed(plans.turns, policy.sets, after), go_on)
         worth, other_worth = (plans.worth_of(each) for each in (policy.sets, tried))
         better = other_worth > worth + 1e-10 * (1.0 + np.abs(worth))
-        sets = mixed(plans.layout, better, tried, policy.sets)
+        sets = mixed(plans.turns, better, tried, policy.sets)
         policy = risen(policy, plans, sets) or policy
         if not go_on():
             break
@@ -158,7 +158,7 @@ def exchanged(
         better = risen(policy, plans, sets)
         if better is not None:
             # Where nothing was gained nothing is tried again, until the others have settled as well: V has then moved.
-            moved = rows_changed(plans.layout, policy.sets, sets)
+            moved = rows_changed(plans.turns, policy.sets, sets)
             policy, tried = better, moved
         elif tried.all():
             policy.settled = go_on()  # else some parts were left out
@@ -219,36 +219,33 @@ def exchange(
 def _parts(plans: Plans, rows: IndexArray) -> Iterator[IndexArray]:
     """The `rows` `[L]` in order, as many at once as `MOST_NUMBERS` allows."""
     # Rows with 40, 50 and 30 entries, and room for 100: their sums 40, 90, 120 fall into the parts 0, 0, 1.
-    count = plans.layout.count
-    entries = np.max([np.bincount(each, minlength=count) for each in plans.layout.rows], axis=0)
+    before, count = plans.turns[0].before, plans.count
+    owners = [before, *(turn.rows for turn in plans.turns)]
+    entries = np.max([np.bincount(each, minlength=count) for each in owners], axis=0)
     number = (np.cumsum(entries[rows]) - 1) // max(1, MOST_NUMBERS // FLIPPED.shape[1])
     yield from np.split(rows, np.flatnonzero(np.diff(number)) + 1)
 
 
 def _cut(plans: Plans, rows: IndexArray) -> tuple[Plans, list[IndexArray]]:
     """The plans of some rows, and which decisions are theirs, for each step."""
-    some = np.zeros(plans.layout.count, dtype=bool)
+    some = np.zeros(plans.count, dtype=bool)
     some[rows] = True
-    kept = [np.flatnonzero(some[owner]) for owner in plans.layout.rows]
-    local = [
-        np.searchsorted(rows, owner[now])
-        for owner, now in zip(plans.layout.rows, kept, strict=True)
-    ]
-    turns: list[Turn] = []
-    decisions: list[IndexArray] = []
-    for turn, before, now, owner in zip(plans.turns, kept, kept[1:], local[1:], strict=False):
+    number = np.cumsum(some) - 1
+    start = now = np.flatnonzero(some[plans.turns[0].before])
+    turns, decisions, detected = list[Turn](), list[IndexArray](), list[Array]()
+    for turn, worth in zip(plans.turns, plans.detected, strict=True):
+        before, now = now, np.flatnonzero(some[turn.rows])
         mine = np.flatnonzero(some[turn.choice.rows])
         moves = turn.moves[before]
         # Moves of these rows lead to entries of theirs alone.
         place = np.searchsorted(now, moves.indices)
         moves = sparse.csr_array((moves.data, place, moves.indptr), shape=(len(before), len(now)))
+        owners = number[turn.before[before]], number[turn.rows[now]]
         choice = turn.choice.part(mine, now, rows)
-        turns.append(Turn(owner, moves, turn.stay[before], choice, turn.price[mine]))
+        turns.append(Turn(*owners, moves, turn.stay[before], choice, turn.price[mine]))
         decisions.append(mine)
-    detected = [each[now, 0] for each, now in zip(plans.detected, kept[1:], strict=True)]
-    layout = Layout(local[0], turns, len(rows))
-    last = plans.missed[kept[-1], 0]
-    return Plans(layout, plans.mass[kept[0], 0], detected, last), decisions
+        detected.append(worth[now, 0])
+    return Plans(turns, plans.mass[start, 0], detected, plans.missed[now, 0]), decisions
 
 
 def _exchanged(plans: Plans, sets: Sequence[BoolArray]) -> list[BoolArray]:
@@ -287,12 +284,17 @@ def _ranks(plans: Plans, step: int, plan: list[BoolArray], mass: Array) -> Index
     choice = plans.turns[step - 1].choice
     later = plans.after(plan[step - 1 :], step - 1)[0]
     gain = mass * (plans.detected[step - 1] - later)
-    margin = choice.margin(plan[step - 1], gain, plans.priced(step, mass))
+    price = plans.priced(step, mass)
+    change = np.abs(choice.changes(plan[step - 1], gain, price))
+    far = np.full_like(change, np.inf)
+    # Free sensors come last: no price would make them nearly worth leaving out.
+    with np.errstate(over="ignore"):  # a price near the least of all numbers: far away
+        margin = np.divide(change, price, out=far, where=price > 0)[:, 0]
     possible = choice.gained(mass)[:, 0] > 0
+    if choice.allowed is not None:
+        possible &= choice.allowed[:, 0]
     # Least margin first within each row, the impossible ones last.
     order = np.lexsort((margin, ~possible, choice.rows))
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.minimum(ranks(choice.rows), SINGLES)
-    if choice.allowed is not None:
-        possible &= choice.allowed[:, 0]
     return np.where(possible, rank, SINGLES)

@@ -135,26 +135,24 @@ def trace(
     return run.result()
 
 
+@dataclass(eq=False)
 class _Trace:
     """The corners and lines found so far."""
 
-    def __init__(
-        self,
-        world: World,
-        choice: BaselineConfig,
-        resolution: float,
-        on_progress: Watch | None,
-        near: float | None,
-    ) -> None:
-        self.world, self.choice = world, choice
-        self.resolution, self.on_progress, self.near = resolution, on_progress, near
-        self.weights = relative_prices(world.cost)
-        self.equal_prices = bool((self.weights[world.available] == 1.0).all())
+    world: World
+    choice: BaselineConfig
+    resolution: float
+    on_progress: Watch | None
+    near: float | None
+    interrupted: bool = False
+
+    def __post_init__(self) -> None:
+        self.weights = relative_prices(self.world.cost)
+        self.equal_prices = bool((self.weights[self.world.available] == 1.0).all())
         self.hull: list[Corner] = []
         self.slopes: list[float] = []
         self.bounds: list[float] = []
         self.steps = 0.0
-        self.interrupted = False
         self.started = time.monotonic()
 
     def solve(self, price: float, start: PolicyTable | None = None) -> Corner:

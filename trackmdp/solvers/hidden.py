@@ -211,7 +211,7 @@ class Search:
             )
             another += another >= one
             taken = rng.random(len(self.renewal.plans)) < 0.5
-            sets = mixed(self.renewal.layout, taken, pool[another].sets, pool[one].sets)
+            sets = mixed(self.renewal.turns, taken, pool[another].sets, pool[one].sets)
             child = self.searched(Found(self.renewal, sets, pool[one]))
             if _new(child, [each.aihtr for each in pool]):
                 like = min((one, another), key=lambda place: _differences(child, pool[place]))

@@ -13,7 +13,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked_table, valid
 from trackmdp.solvers.certify.branch import Tree
 from trackmdp.solvers.certify.inner import InnerProblem
-from trackmdp.solvers.certify.known import adopted, first_guess, tables, up_to
+from trackmdp.solvers.certify.known import adopted, tables, up_to
 from trackmdp.solvers.exchange import exchange
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.world.model import World
@@ -66,12 +66,13 @@ def _first_set(problem: InnerProblem, mass: Array, states: IndexArray) -> BoolAr
     """`[G, 1]` the first set of the best plan from each located cell; `mass` `[E]` is undetected in `states` `[E]`."""
     world, run = problem.world, up_to(_MOST_NODES)
     known = tables(problem, slack=_SLACK, run=run)
-    sets = first_guess(problem, known, mass)
-    sets = exchange(problem.plans(mass), sets, np.ones(world.num_cells, dtype=bool))
+    plans = problem.plans(mass)
+    sets = plans.ascend(plans.none(), sweeps=10)
+    sets = exchange(plans, sets, np.ones(world.num_cells, dtype=bool))
     # One problem per located cell: its undetected mass after the sets carried out so far.
-    place = problem.layout.rows[0], states
+    place = problem.turns[0].before, states
     here = sparse.csr_array((mass, place), shape=(world.num_cells, world.num_cells))
     here.eliminate_zeros()
-    tree = Tree(problem, known, problem.worth(sets, mass), _SLACK, here)
+    tree = Tree(problem, known, plans.worth_of(sets), _SLACK, here)
     run(tree)
     return (adopted(problem, sets, tree, mass) or sets)[0]

@@ -28,13 +28,14 @@ class Turn:
     """One free choice, for all K rows.
 
     Attributes:
-        rows: `[E]`, row of each entry.
+        before, rows: `[E_before]` and `[E]`, row of each entry before the move and after it.
         moves: `[E_before, E]`, probability of each move.
         stay: `[E_before]`, probability that the target is still in the grid after the move.
         choice: the decisions about the entries.
         price: `[G]`, of the sensor of each decision.
     """
 
+    before: IndexArray
     rows: IndexArray
     moves: sparse.csr_array
     stay: Array
@@ -46,57 +47,49 @@ class Turn:
         """`[E, E_before]`, the moves the other way round."""
         return sparse.csr_array(self.moves.T)
 
-
-class Layout:
-    """Entries and decisions of the plans of K rows, for any worth of a detection.
-
-    Args:
-        rows: `[E_0]`, row of each entry at the start.
-        turns: the free choices.
-        count: K.
-    """
-
-    def __init__(self, rows: IndexArray, turns: Sequence[Turn], count: int) -> None:
-        self.turns, self.count = list(turns), count
-        self.rows = [rows, *(turn.rows for turn in turns)]
+    @cached_property
+    def starts(self) -> sparse.csr_array:
+        """`[K, E_before]`, sums over the entries of each row before the move."""
+        return summing(self.before, self.choice.count)
 
     @cached_property
-    def sums(self) -> list[sparse.csr_array]:
-        """`[K, E]` for the start and each step, sums over the entries of each row."""
-        return [summing(rows, self.count) for rows in self.rows]
+    def sums(self) -> sparse.csr_array:
+        """`[K, E]`, the same after it."""
+        return summing(self.rows, self.choice.count)
 
     @cached_property
-    def pay(self) -> list[sparse.csr_array]:
-        """`[K, G]` for each free choice, prices of the decisions of each row, which are in order."""
-        return [with_data(summing(turn.choice.rows, self.count), turn.price) for turn in self.turns]
+    def pay(self) -> sparse.csr_array:
+        """`[K, G]`, prices of the decisions of each row, which are in order."""
+        return with_data(summing(self.choice.rows, self.choice.count), self.price)
 
 
 class Plans:
     """The plans of K rows, the worth of a detection given.
 
     Args:
-        layout: entries and decisions.
+        turns: the free choices.
         mass: `[E_0]`, weight of each entry at the start.
         detected: `[E]` for each turn, worth of locating the target there, r + V.
         missed: `[E]`, worth of the target's being missed at the last turn.
         credit: `[E]` for each turn, optimistic gain of locating the target there over missing it; None: none is known.
 
     Attributes:
+        count: K.
         length: H, free choices.
-        turns: those of the layout.
+        turns: as given.
         mass, missed: `[E, 1]` as given.
         detected: `[E, 1]` for each turn.
     """
 
     def __init__(
         self,
-        layout: Layout,
+        turns: Sequence[Turn],
         mass: Array,
         detected: Sequence[Array],
         missed: Array,
         credit: Sequence[Array] | None = None,
     ) -> None:
-        self.layout, self.turns, self.length = layout, layout.turns, len(layout.turns)
+        self.turns, self.length, self.count = turns, len(turns), turns[0].choice.count
         self.mass, self.missed, self._credit = mass[:, None], missed[:, None], credit
         self.detected = [each[:, None] for each in detected]
 
@@ -107,7 +100,7 @@ class Plans:
         # In place: new arrays would take as long as the sums.
         ahead = (self.detected[t - 1] - later) * turn.choice.report(on)
         ahead += later
-        paid = (self.layout.pay[t - 1] @ on)[self.layout.rows[t - 1]]
+        paid = (turn.pay @ on)[turn.before]
         paid *= turn.stay[:, None]
         return turn.moves @ ahead - paid
 
@@ -121,7 +114,7 @@ class Plans:
     def worth(self, sets: Sequence[BoolArray]) -> Array:
         """`[K, C]`, expected reward of whole plans."""
         start = self.undetected(1, sets[0], self.after(sets)[0])
-        return self.layout.sums[0] @ (self.mass * start)
+        return self.turns[0].starts @ (self.mass * start)
 
     def worth_of(self, sets: Sequence[BoolArray]) -> Array:
         """`[K]`, the same of one candidate."""
@@ -144,7 +137,8 @@ class Plans:
 
     def _come(self, t: int, mass: Array) -> Array:
         """`[G, C]`, the part of `mass` `[E, C]` at step t that is in the row of each decision."""
-        return (self.layout.sums[t] @ mass)[self.turns[t - 1].choice.rows]
+        turn = self.turns[t - 1]
+        return (turn.sums @ mass)[turn.choice.rows]
 
     def ascend(
         self,

@@ -7,14 +7,15 @@ iteration. Beliefs multiply with the actions tried, so this is for worlds of a f
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias, TypeVar
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.types import Array, BoolArray
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.solvers.linear import accumulate
 from trackmdp.world.model import World
@@ -40,31 +41,62 @@ class BeliefSolution:
     beliefs: int
 
 
-def solve_states(
-    starts: Sequence[State], choices: Callable[[State], Iterable[tuple[float, dict[State, float]]]]
-) -> tuple[dict[State, float], dict[State, Array]]:
-    """Policy iteration over all states reached from `starts`: the optimal value of each, and the worth of its choices.
+@dataclass(frozen=True)
+class Chain(Generic[State]):
+    """All states that choices lead to, and their choices.
 
-    Of a state, `choices` gives the expected reward of each choice and the probabilities of the next states.
+    Attributes:
+        states: the starts, and then the others.
+        owner: `[C]`, place of the state of each choice.
+        totals: `[C]` or `[C, K]`, expected reward, or figures, of each choice.
+        moves: `[C, states]`, probability of each state after it.
     """
-    states, index = list(starts), {state: place for place, state in enumerate(starts)}
-    rewards, columns, data = list[float](), list[int](), list[float]()
-    pointer, begins = [0], list[int]()
-    for state in states:  # grows while it is gone through
-        begins.append(len(rewards))
+
+    states: list[State]
+    owner: IndexArray
+    totals: Array
+    moves: sparse.csr_array
+
+
+def reached(
+    starts: Iterable[State],
+    choices: Callable[[State], Iterable[tuple[Any, dict[State, float]]]],
+    most: float = math.inf,
+) -> Chain[State] | None:
+    """The states reached from `starts`; None where there are more than `most`.
+
+    Of a state, `choices` gives the totals of each choice and the probabilities of the next states.
+    """
+    states = list(starts)
+    index = {state: place for place, state in enumerate(states)}
+    owner, totals, pointer = list[int](), list[Any](), [0]
+    columns, data = list[int](), list[float]()
+    for place, state in enumerate(states):  # grows while it is gone through
         for earned, after in choices(state):
             for each in after:
                 if each not in index:
                     index[each] = len(states)
                     states.append(each)
-            rewards.append(earned)
             columns += [index[each] for each in after]
             data += after.values()
+            owner.append(place)
+            totals.append(earned)
             pointer.append(len(data))
-    moves = sparse.csr_array((data, columns, pointer), shape=(len(rewards), len(states)))
+        if len(states) > most:
+            return None
+    moves = sparse.csr_array((data, columns, pointer), shape=(len(owner), len(states)))
+    return Chain(states, np.array(owner), np.array(totals), moves)
+
+
+def solve_states(
+    starts: Sequence[State], choices: Callable[[State], Iterable[tuple[float, dict[State, float]]]]
+) -> tuple[dict[State, float], dict[State, Array]]:
+    """Policy iteration over all states `reached`: the optimal value of each, and the worth of its choices."""
+    chain = reached(starts, choices)
+    assert chain is not None  # any number may be
+    states, owner, reward, moves = chain.states, chain.owner, chain.totals, chain.moves
     # States with 3, 2 and 1 choices have first = (0, 3, 5), the segments that reduceat takes the maximum over.
-    reward, first = np.array(rewards), np.array(begins)
-    owner = np.repeat(np.arange(len(states)), np.diff(first, append=len(reward)))
+    first = np.flatnonzero(np.diff(owner, prepend=-1))
     choice, value = first, accumulate(moves[first], reward[first])
     while True:
         worth = reward + moves @ value

@@ -39,6 +39,7 @@ from trackmdp.solvers.partition import (
 )
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.value import value_of
+from trackmdp.solvers.walk import Step
 from trackmdp.solvers.workers import Crew, Made, in_turn
 from trackmdp.world.model import World
 
@@ -152,9 +153,9 @@ def _predicted(world: World) -> float:
     patch, entries = sub_world(world, (rows, columns)), list[int]()
     rule = rules.clocked_rule(patch)
 
-    def counted(seen: rules.Prediction) -> rules.Offer:
-        entries.append(len(seen.rows))
-        return rule(seen)
+    def counted(step: Step, before: Array, mass: Array) -> rules.Offer:
+        entries.append(len(mass))
+        return rule(step, before, mass)
 
     rules.unroll(patch, counted)
     return max(entries) / patch.num_cells

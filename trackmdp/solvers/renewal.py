@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
+from itertools import pairwise
 from typing import TypeAlias, cast
 
 import numpy as np
@@ -24,7 +25,7 @@ from trackmdp.sensing.task import Task
 from trackmdp.solvers.events import Events
 from trackmdp.solvers.linear import DIRECT_CELLS, TOLERANCE, RenewalSystem
 from trackmdp.solvers.mass import Passed, passed, passed_last
-from trackmdp.solvers.plans import Layout, Plans, Turn
+from trackmdp.solvers.plans import Plans, Turn
 from trackmdp.solvers.value import event_groups, first_events, whole_renewals
 from trackmdp.solvers.walk import Step, Walk, all_events
 from trackmdp.world.model import World
@@ -167,22 +168,16 @@ class Renewal:
         if credit is not None:
             credit = [each[step.states] for each, step in zip(credit, free, strict=True)]
         mass = np.ones(self.normal) if weight is None else weight[: self.normal]
-        return Plans(self.layout, mass, detected, self.missed(value), credit)
+        return Plans(self.turns, mass, detected, self.missed(value), credit)
 
     @cached_property
-    def layout(self) -> Layout:
+    def turns(self) -> list[Turn]:
         """Entries and decisions of the plans of all keys."""
-        turns = [
-            Turn(
-                self.owner[step.rows],
-                step.moves,
-                step.stay,
-                choice,
-                self.task.prices[choice.sensors],
-            )
-            for step, choice in zip(self.steps, self.choices, strict=False)
+        rows = [self.owner[: self.normal], *(self.owner[step.rows] for step in self.steps)]
+        return [
+            Turn(*ends, step.moves, step.stay, choice, self.task.prices[choice.sensors])
+            for ends, step, choice in zip(pairwise(rows), self.steps, self.choices, strict=False)
         ]
-        return Layout(self.owner[: self.normal], turns, len(self.plans))
 
     def missed(self, value: Array) -> Array:
         """`[E]` worth of the target's being missed at the last free choice."""
@@ -209,7 +204,7 @@ class Renewal:
         """The same renewal with the prices of another task."""
         other = copy.copy(self)
         other.task = task
-        other.__dict__.pop("layout", None)
+        other.__dict__.pop("turns", None)
         return other
 
     def sets(self, policy: PolicyTable) -> list[BoolArray]:

@@ -8,44 +8,25 @@ cell alone.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 
 from trackmdp.arrays.entries import per_row
-from trackmdp.arrays.types import Array, IndexArray
+from trackmdp.arrays.types import Array
 from trackmdp.policies.table import PolicyTable
 from trackmdp.sensing.choose import TIE
 from trackmdp.sensing.decisions import sensing
 from trackmdp.solvers.bounds import clocked_table
-from trackmdp.solvers.walk import Walk, all_events
+from trackmdp.solvers.walk import Step, Walk, all_events
 from trackmdp.world.model import World
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """Where the target may be next, for all located cells at once, after n misses.
-
-    Attributes:
-        n: misses so far.
-        rows, cells: `[E]`, located cell and possible next cell of each entry.
-        mass: `[E]`, joint probability of the misses so far and the target moving to `cells`.
-        before: `[M]`, probability of the n misses.
-        inside: `[M]`, probability of the misses and of still being in the grid after the move.
-    """
-
-    n: int
-    rows: IndexArray
-    cells: IndexArray
-    mass: Array
-    before: Array
-    inside: Array
-
 
 Offer: TypeAlias = tuple[Array, Array, Array]
 """Of sensing in one step, for all located cells: `[E]` gain of a report, `[S]` price of each sensor, and `[M]` factor
 of the prices for each located cell."""
+Rule: TypeAlias = Callable[[Step, Array, Array], Offer]
+"""From a step of all located cells, the probability `[M]` of the misses so far, and jointly with them the probability
+`[E]` of the target's moving to each entry."""
 
 
 def qmdp(world: World, *, in_grid: bool = False) -> PolicyTable:
@@ -59,7 +40,11 @@ def qmdp(world: World, *, in_grid: bool = False) -> PolicyTable:
         in_grid: charge sensors like the reward does, only while the target is in the grid: p_d p_j r >= c_j p_in.
     """
     # Multiplied by the probability of the misses, which need not be divided by then.
-    return unroll(world, lambda seen: _offer(world, seen, seen.inside if in_grid else seen.before))
+
+    def rule(step: Step, before: Array, mass: Array) -> Offer:
+        return _offer(world, mass, step.summed(mass) if in_grid else before)
+
+    return unroll(world, rule)
 
 
 def fcr(world: World, *, in_grid: bool = False) -> PolicyTable:
@@ -71,9 +56,11 @@ def fcr(world: World, *, in_grid: bool = False) -> PolicyTable:
     """
     # Without learning `mass` is e_x P^(n+1) itself: no probability of misses has to be divided by.
     always = np.ones(world.num_cells)
-    return unroll(
-        world, lambda seen: _offer(world, seen, seen.inside if in_grid else always), learns=False
-    )
+
+    def rule(step: Step, _: Array, mass: Array) -> Offer:
+        return _offer(world, mass, step.summed(mass) if in_grid else always)
+
+    return unroll(world, rule, learns=False)
 
 
 def myopic(world: World, *, threshold: float | None = None) -> PolicyTable:
@@ -85,7 +72,7 @@ def myopic(world: World, *, threshold: float | None = None) -> PolicyTable:
         return qmdp(world, in_grid=True)
     # The threshold is as a price, the same of all sensors.
     limit = np.where(world.available, threshold, world.prices) * (1.0 - TIE)
-    return unroll(world, lambda seen: (seen.mass, limit, seen.before))
+    return unroll(world, lambda _, before, mass: (mass, limit, before))
 
 
 def clocked_policy(world: World) -> PolicyTable:
@@ -99,39 +86,34 @@ def clocked_policy(world: World) -> PolicyTable:
     return unroll(world, clocked_rule(world))
 
 
-def clocked_rule(world: World) -> Callable[[Prediction], Offer]:
+def clocked_rule(world: World) -> Rule:
     """The rule of `clocked_policy`."""
     table = clocked_table(world).table
 
-    def gains(seen: Prediction) -> Offer:
-        credit = world.reward + table[seen.cells, 0] - table[seen.cells, seen.n + 1]
-        return seen.mass * credit, world.prices, seen.inside
+    def gains(step: Step, _: Array, mass: Array) -> Offer:
+        credit = world.reward + table[step.states, 0] - table[step.states, step.n + 1]
+        return mass * credit, world.prices, step.summed(mass)
 
     return gains
 
 
-def unroll(
-    world: World, rule: Callable[[Prediction], Offer], *, learns: bool = True
-) -> PolicyTable:
+def unroll(world: World, rule: Rule, *, learns: bool = True) -> PolicyTable:
     """The policy that takes the set of most worth by a `rule` from a prediction, within the task's window.
 
     Cells of probability zero are never sensed, and after a miss that cannot happen nothing is.
     """
-    motion, mass, sensed = world.motion, np.ones(world.num_cells), []
-    walk = Walk(world, motion, all_events(world, world.remembering().keys, motion))
-    for n in range(world.num_choices):
+    mass, sensed, located = np.ones(world.num_cells), [], np.arange(world.num_cells)
+    keys = world.remembering().keys
+    walk = Walk(world, world.motion, all_events(world, keys, world.motion))
+    for _ in range(world.num_choices):
         step = walk.move()
-        before, now = per_row(step.before, mass, world.num_cells), mass @ step.moves
-        inside = step.summed(now)
         # Joint with the misses, not conditioned on them.
-        seen = Prediction(n, step.rows, step.states, now, before, inside)
-        gain, prices, charge = rule(seen)
-        located = np.arange(world.num_cells)
-        choice = sensing(world, seen.rows, seen.cells, world.num_cells, located, distinct=True)
+        before, mass = per_row(step.before, mass, world.num_cells), mass @ step.moves
+        gain, prices, charge = rule(step, before, mass)
+        choice = sensing(world, step.rows, step.states, world.num_cells, located, distinct=True)
         price = prices[choice.sensors] * charge[choice.rows]
         on = choice.best(gain[:, None], price[:, None])
         sensed.append((choice.rows[on[:, 0]], choice.sensors[on[:, 0]]))
-        mass = now
         if learns:
             left = 1.0 - choice.report(on)[:, 0]
             mass = mass * left
@@ -139,6 +121,6 @@ def unroll(
     return PolicyTable.from_sensed(world.remembering(), sensed)
 
 
-def _offer(world: World, seen: Prediction, charged: Array) -> Offer:
+def _offer(world: World, mass: Array, charged: Array) -> Offer:
     """The reward of a report at once, and the price of a sensor where it is `charged`; to gain it is enough."""
-    return seen.mass * world.reward, world.prices * (1.0 - TIE), charged
+    return mass * world.reward, world.prices * (1.0 - TIE), charged

@@ -22,7 +22,7 @@ from trackmdp.arrays.entries import ends_of
 from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked_table
-from trackmdp.solvers.plans import Layout, Plans
+from trackmdp.solvers.plans import Plans, Turn
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.value import visits_of
 from trackmdp.world.model import World
@@ -104,8 +104,8 @@ def risen(policy: Found, plans: Plans, sets: Sequence[BoolArray]) -> Found | Non
     is too large for that: the plans of those rows that gain most, half as many each time, and at last some rows alone.
     A few changes alter the visits little, so that their gains are those expected.
     """
-    renewal, layout, old = policy.renewal, plans.layout, policy.sets
-    moved = rows_changed(layout, old, sets)
+    renewal, turns, old = policy.renewal, plans.turns, policy.sets
+    moved = rows_changed(turns, old, sets)
     if not moved.any():
         return None
     worth, other = (plans.worth_of(each) for each in (old, sets))
@@ -120,9 +120,9 @@ def risen(policy: Found, plans: Plans, sets: Sequence[BoolArray]) -> Found | Non
         # With the visits as they are so little is gained that it would not count: not worth an exact evaluation.
         if not renewal.single and gain[rows].sum() <= policy.rounding:
             continue
-        chosen = np.zeros(layout.count, dtype=bool)
+        chosen = np.zeros(plans.count, dtype=bool)
         chosen[rows] = True
-        tried = Found(renewal, mixed(layout, chosen, sets, old), policy)
+        tried = Found(renewal, mixed(turns, chosen, sets, old), policy)
         if tried.aihtr > policy.aihtr + policy.rounding:
             return tried
     return None
@@ -158,22 +158,25 @@ def _gaining(policy: Found, sets: Sequence[BoolArray], order: IndexArray) -> Ind
 
 
 def rows_changed(
-    layout: Layout, before: Sequence[BoolArray], after: Sequence[BoolArray]
+    turns: Sequence[Turn], before: Sequence[BoolArray], after: Sequence[BoolArray]
 ) -> BoolArray:
     """`[K]`, the rows in which the sets differ."""
-    found = np.zeros(layout.count, dtype=bool)
-    for turn, old, new in zip(layout.turns, before, after, strict=True):
+    found = np.zeros(turns[0].choice.count, dtype=bool)
+    for turn, old, new in zip(turns, before, after, strict=True):
         found[turn.choice.rows[(old != new)[:, 0]]] = True
     return found
 
 
 def mixed(
-    layout: Layout, rows: BoolArray, these: Sequence[BoolArray], others: Sequence[BoolArray]
+    turns: Sequence[Turn],
+    rows: BoolArray,
+    these: Sequence[BoolArray],
+    others: Sequence[BoolArray],
 ) -> list[BoolArray]:
     """`[G, 1]` for each free choice: `these` sets in the `rows` `[K]` that are chosen, else the `others`."""
     return [
         np.where(rows[turn.choice.rows, None], this, other)
-        for turn, this, other in zip(layout.turns, these, others, strict=True)
+        for turn, this, other in zip(turns, these, others, strict=True)
     ]
 
 
@@ -190,7 +193,7 @@ def _episodes(policy: Found, plans: Plans) -> Array | float:
     if policy.visits is None:
         return 1.0
     visits = policy.renewal.by_plan(policy.visits)
-    mass = (plans.layout.sums[0] @ plans.mass)[:, 0]
+    mass = (plans.turns[0].starts @ plans.mass)[:, 0]
     # Visits as solved for may be a rounding below 0.
     return np.where(mass > 1e-12, visits / np.maximum(mass, 1e-12), 0.0)
 

@@ -25,7 +25,7 @@ from trackmdp.policies.table import PolicyTable, SetTable
 from trackmdp.recordings.tracks import Recorded, Tracks
 from trackmdp.sensing.task import Task
 from trackmdp.solvers.evaluation import Evaluation, ReplayedTracks, by_start, pooled
-from trackmdp.solvers.events import Events, detected_codes
+from trackmdp.solvers.events import Events, started
 from trackmdp.solvers.linear import DIRECT_CELLS, RenewalSystem, solve_onward
 from trackmdp.solvers.mass import Passed, passed, passed_last
 from trackmdp.solvers.motion_totals import check_length, expected_steps, still_to_come
@@ -188,9 +188,7 @@ def _figures(world: World, events: Events, totals: Array, error: float = 0.0) ->
 
 def first_events(events: Events, motion: Motion) -> IndexArray:
     """`[F]`, the event with which each of the F episodes starts."""
-    keys, first = events.keys, motion.first
-    key = keys.start(motion.cell[first], first % motion.modes)
-    return np.searchsorted(events.codes, detected_codes(keys, key, first))
+    return np.searchsorted(events.codes, started(events.keys, motion, motion.first))
 
 
 def event_groups(motion: Motion, states: IndexArray) -> IndexArray:

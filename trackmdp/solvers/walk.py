@@ -23,7 +23,7 @@ from trackmdp.arrays.types import Array, BoolArray, IndexArray, Indices
 from trackmdp.memory.keys import KeySpace
 from trackmdp.motion.chain import Motion
 from trackmdp.sensing.task import Task
-from trackmdp.solvers.events import Events, detected_codes, forced_codes
+from trackmdp.solvers.events import Events, detected_codes, forced_codes, started
 
 _FEW = 2**14
 """States whose moves are gathered here: before SciPy looks at a single one, it takes a tenth of a millisecond."""
@@ -182,12 +182,11 @@ class Walk:
         events, motion, keys = self._events, self._motion, self._events.keys
         if self._closed and events.complete:
             return states, states + motion.num_states if misses else None
-        cell, mode = motion.cell[states], states % motion.modes
-        before = events.key[rows] if keys.order else None
-        after = keys.start(cell, mode) if before is None else keys.next(before, self._n, cell, mode)
+        key = events.key[rows]
+        after = keys.next(key, self._n, motion.cell[states], states % motion.modes)
         found = [detected_codes(keys, after, states)]
         if misses:
-            found.append(forced_codes(keys, motion.num_states, before, states))
+            found.append(forced_codes(keys, motion.num_states, key, states))
         if self._closed:
             found = [np.searchsorted(events.codes, codes) for codes in found]
         return found[0], found[1] if misses else None
@@ -226,14 +225,11 @@ def all_events(
     """
     states = np.arange(motion.num_states)
     if keys.order == 0:
-        key = keys.start(motion.cell, states % motion.modes)
-        parts = [detected_codes(keys, key, states)]
+        parts = [started(keys, motion, states)]
         if not task.safe:
-            parts.append(forced_codes(keys, motion.num_states, None, states))
+            parts.append(forced_codes(keys, motion.num_states, states, states))
         return Events(keys, motion.num_states, np.concatenate(parts))
-    first = motion.first
-    key = keys.start(motion.cell[first], first % motion.modes)
-    known = frontier = np.unique(detected_codes(keys, key, first))
+    known = frontier = np.unique(started(keys, motion, motion.first))
     if motion.ends is not None:
         return _along_tracks(task, motion, Events(keys, motion.num_states, known), reports)
     while len(frontier):

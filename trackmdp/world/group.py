@@ -257,7 +257,9 @@ def _check_tracks(count: int, parts: Mapping[str, Tracks]) -> None:
 
 def _alike(one: World, other: World) -> bool:
     """Whether two worlds are the same task."""
-    prices, limits = ("cost", "safe_cost", "reward"), ("size", "t_max", "budget", "max_steps")
-    names = (*prices, *limits, "detection", "safe_detection")
-    pairs = [(getattr(one, name), getattr(other, name)) for name in names]
-    return all(np.array_equal(a, b, equal_nan=isinstance(a, np.ndarray)) for a, b in pairs)
+    theirs = other.given
+    return all(
+        np.array_equal(mine, theirs[name], equal_nan=isinstance(mine, np.ndarray))
+        for name, mine in one.given.items()
+        if name not in ("place", "clip")
+    )

@@ -173,18 +173,16 @@ def _check_tracks(tracks: Tracks, num_cells: int) -> None:
     Raises:
         ValueError: they do.
     """
-    whole = len(tracks.first) == len(tracks.exits) + 1 == len(tracks.names) + 1
-    whole = whole and len(tracks) > 0 and bool((tracks.lengths > 0).all())
-    if not whole or tracks.first[0] != 0 or tracks.first[-1] != len(tracks.cells):
-        raise ValueError("tracks that do not follow each other")
-    begins = tracks.begins
-    if begins is not None and not (begins.shape == tracks.exits.shape and (begins >= 0).all()):
-        raise ValueError(f"begins {begins.shape} of {len(tracks)} tracks")
-    whole_numbers = [tracks.cells, tracks.first, *([] if begins is None else [begins])]
-    if any(each.dtype != np.int64 for each in whole_numbers) or tracks.exits.dtype != bool:
-        raise ValueError("cells, first, begins or exits of another type")
-    if not ((tracks.cells >= 0) & (tracks.cells < num_cells)).all():
-        raise ValueError(f"a cell outside the grid of {num_cells} cells")
+    begins, first, count = tracks.begins, tracks.first, len(tracks.exits)
+    whole_numbers = [tracks.cells, first, *([] if begins is None else [begins])]
+    fine = all(each.dtype == np.int64 for each in whole_numbers) and tracks.exits.dtype == bool
+    fine = fine and len(first) == count + 1 == len(tracks.names) + 1 > 1
+    fine = fine and bool((tracks.lengths > 0).all())
+    fine = fine and first[0] == 0 and first[-1] == len(tracks.cells)
+    if begins is not None:
+        fine = fine and begins.shape == (count,) and bool((begins >= 0).all())
+    if not fine or not ((tracks.cells >= 0) & (tracks.cells < num_cells)).all():
+        raise ValueError(f"tracks that do not follow each other on a grid of {num_cells} cells")
 
 
 def refuse_given(*_: object, **__: object) -> Subject:

@@ -194,8 +194,8 @@ class Tree:
             (split.left, split.relaxed - regret, split.lost, regret),
             (left, split.relaxed, np.maximum(split.lost, raw + added[:, 0]), added[:, 0]),
         ):
-            apart = relaxed - lost - frontier.rest[split.state, k + 1]
-            bound = np.minimum(split.bound, np.minimum(apart, together - (paid - least[:, 0])))
+            tighter = np.minimum(relaxed - lost, together - (paid - least[:, 0]))
+            bound = np.minimum(split.bound, tighter)
             self._push(Choices(frontier, k + 1, split.state, cells, relaxed, lost, bound))
 
     def _advance(self, batches: list[Choices]) -> None:
@@ -248,7 +248,7 @@ class Tree:
         if not self._world.perfect:
             frontier = replace(frontier, missed=(moved - found)[kept])
         frontier = self._losses.looked_ahead(frontier)
-        first = Choices.undecided(frontier, frontier.relaxed - frontier.rest[:, 0])
+        first = Choices.undecided(frontier)
         if frontier.missed is not None:  # the missed mass has this loss under every choice
             lost = self._losses.joint(first)
             first = replace(first, lost=lost, bound=first.bound - lost)

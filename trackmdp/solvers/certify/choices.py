@@ -25,7 +25,6 @@ class Frontier:
         before: `[B, M]`, undetected mass before the target moves.
         missed: `[B, M]`, mass that all sensors together would miss; None where no sensor misses.
         count: `[B]`, cells that are not padding.
-        rest: `[B, K + 1]`, least that the cells from the k-th on take away from `relaxed`.
         after: where the target goes on to from `cells`; None where that is not looked at.
         origin: the choices these states came from; none at the start.
     """
@@ -37,7 +36,6 @@ class Frontier:
     mass: Array
     regret: Array
     count: IndexArray
-    rest: Array
     before: sparse.csr_array
     origin: Origin | None
     missed: sparse.csr_array | None = None
@@ -79,9 +77,8 @@ class Frontier:
             moved.data[entry],
             regret[entry],
         )
-        rest, source = np.zeros((shape[0], shape[1] + 1)), origin and origin.pick(kept)
-        at_start = start[kept], sets_left, relaxed[kept]
-        return cls(*at_start, cells, mass, loss, count, rest, before[kept], source)
+        at_start, source = (start[kept], sets_left, relaxed[kept]), origin and origin.pick(kept)
+        return cls(*at_start, cells, mass, loss, count, before[kept], source)
 
 
 @dataclass(frozen=True)
@@ -100,10 +97,11 @@ class Choices:
     bound: Array
 
     @classmethod
-    def undecided(cls, frontier: Frontier, bound: Array) -> Choices:
+    def undecided(cls, frontier: Frontier) -> Choices:
         """Nothing decided yet in any state."""
         states, none = np.arange(len(frontier.start)), np.zeros(frontier.cells.shape, dtype=bool)
-        return cls(frontier, 0, states, none, frontier.relaxed, np.zeros(len(states)), bound)
+        most = frontier.relaxed
+        return cls(frontier, 0, states, none, most, np.zeros(len(states)), most)
 
     def left_cells(self) -> tuple[IndexArray, IndexArray, Array]:
         """The cells left unsensed: the choice, the cell and the mass there of each.

@@ -10,11 +10,12 @@ from functools import cached_property
 
 import numpy as np
 
-from trackmdp.arrays.types import Array, BoolArray
+from trackmdp.arrays.types import Array
 from trackmdp.sensing.decisions import sensing
 from trackmdp.solvers.motion_totals import forced_worth
-from trackmdp.solvers.plans import Layout, Plans
+from trackmdp.solvers.plans import Plans, Turn
 from trackmdp.solvers.renewal import Renewal
+from trackmdp.solvers.walk import Step
 from trackmdp.world.model import World
 
 
@@ -50,35 +51,25 @@ class InnerProblem:
         """The problem."""
         return self.renewal.world
 
+    @property
+    def steps(self) -> list[Step]:
+        """Those of the sets to be chosen."""
+        return self.renewal.steps[self.first : self.first + self.length]
+
     @cached_property
-    def layout(self) -> Layout:
+    def turns(self) -> list[Turn]:
         """Entries and decisions."""
-        whole = self.renewal.layout
-        turns = whole.turns[self.first : self.first + self.length]
-        if not self.windowed and self.world.window is not None:
-            steps = self.renewal.steps[self.first : self.first + self.length]
-            turns = [
-                replace(turn, choice=choice, price=self.world.prices[choice.sensors])
-                for turn, step in zip(turns, steps, strict=True)
-                for choice in [sensing(self.world, step.rows, step.states, whole.count)]
-            ]
-        return Layout(whole.rows[self.first], turns, whole.count)
+        turns = self.renewal.turns[self.first : self.first + self.length]
+        if self.windowed or self.world.window is None:
+            return turns
+        return [
+            replace(turn, choice=choice, price=self.world.prices[choice.sensors])
+            for turn, step in zip(turns, self.steps, strict=True)
+            for choice in [sensing(self.world, step.rows, step.states, self.world.num_cells)]
+        ]
 
-    def plans(self, mass: Array | None = None, credit: list[Array] | None = None) -> Plans:
-        """The plans.
-
-        Args:
-            mass: `[E]`, undetected mass before the first move; None: 1 in each located cell.
-            credit: for each set `[M]`, optimistic gain of locating the target in a cell over missing it.
-        """
-        renewal, layout = self.renewal, self.layout
-        steps = renewal.steps[self.first : self.first + self.length]
-        detected = [self.detected[step.states] for step in steps]
-        if credit is not None:
-            credit = [each[step.states] for each, step in zip(credit, steps, strict=True)]
-        weight = np.ones(len(layout.rows[0])) if mass is None else mass
-        return Plans(layout, weight, detected, self.missed[steps[-1].states], credit)
-
-    def worth(self, sets: list[BoolArray], mass: Array | None = None) -> Array:
-        """`[M]`, worth of the plans `sets` `[G, 1]` from each located cell."""
-        return self.plans(mass).worth_of(sets)
+    def plans(self, mass: Array | None = None) -> Plans:
+        """The plans; `mass` `[E]` is undetected before the first move, without it 1 in each located cell."""
+        detected = [self.detected[step.states] for step in self.steps]
+        weight = np.ones(self.world.num_cells) if mass is None else mass
+        return Plans(self.turns, weight, detected, self.missed[self.steps[-1].states])

@@ -14,19 +14,6 @@ from trackmdp.solvers.certify.delayed import Delayed
 from trackmdp.solvers.certify.inner import InnerProblem
 
 
-def first_guess(
-    problem: InnerProblem, known: list[Array], mass: Array | None = None
-) -> list[BoolArray]:
-    """Sets found by a homotopy from the credit r + V - R, `known` being R_0 ... R_{H-1}; see `search`."""
-    # With H sets, after set t there are H - 1 - t left: credit_t(j) = r + V(j) - R_{H-1-t}(j).
-    credit = [problem.detected - known[problem.length - 1 - t] for t in range(problem.length)]
-    plans = problem.plans(mass, credit)
-    sets = plans.none()
-    for optimism in np.linspace(1.0, 0.0, 11):
-        sets = plans.ascend(sets, sweeps=3, optimism=float(optimism))
-    return sets
-
-
 def tables(
     problem: InnerProblem,
     *,
@@ -47,7 +34,9 @@ def tables(
     for sets in range(len(known), problem.length):
         # R_h needs the first h steps only.
         part = replace(problem, first=0, length=sets, windowed=False)
-        tree = Tree(part, known, part.worth(first_guess(part, known)), slack)
+        plans = part.plans()
+        lower = plans.worth_of(plans.ascend(plans.none(), sweeps=10))
+        tree = Tree(part, known, lower, slack)
         run(tree)
         known.append(tree.upper())
     return known
@@ -78,7 +67,7 @@ def adopted(
     if not better.any():
         return None
     found, mass = [], np.ones(problem.world.num_cells) if mass is None else mass
-    for turn, on, out in zip(problem.layout.turns, sets, left, strict=True):
+    for turn, on, out in zip(problem.turns, sets, left, strict=True):
         mass = mass @ turn.moves
         # A plan of the tree senses every possible cell but those left out.
         rows, cells = turn.choice.rows, turn.choice.sensors

@@ -12,9 +12,9 @@ at hand.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import chain, combinations
+from itertools import combinations
 from typing import TypeAlias
 
 import numpy as np
@@ -25,7 +25,7 @@ from trackmdp.sensing.cover import Shared
 from trackmdp.solvers.plans import Plans
 
 _MOST_BITS = 14
-"""Sensors of a row in all sets but the last up to which all choices are listed; with a budget 2^14 choices."""
+"""Two to the power of this: choices of all sets but the last up to which they are listed."""
 _MOST_PATTERNS = 2**22
 """Choices of all rows; as sets of cells covered, 32 MB of prices."""
 
@@ -54,7 +54,7 @@ def best_plans(
     for number in range(first.count):
         tried = first.of(number)
         earned, mass = _earned(plans, tried)
-        hopeful = earned + plans.layout.sums[plans.length - 1] @ (mass * revealed) > most
+        hopeful = earned + plans.turns[-1].starts @ (mass * revealed) > most
         if not hopeful.any():
             continue
         if not go_on(int(hopeful.sum())):
@@ -96,71 +96,40 @@ def _choices(plans: Plans) -> _Choices | None:
 
 
 def _of_sensors(plans: Plans) -> _Choices | None:
-    """The sets of all steps but the last as bits, of which each sensor of a row has its own."""
-    owners = [turn.choice.rows for turn in plans.turns[:-1]]
-    numbers = list(map(ranks, owners))
-    budget = plans.turns[0].choice.budget
-    found = _all_sets(owners, numbers) if budget is None else _small_sets(numbers, budget)
-    if found is None or plans.layout.count * found[0] > _MOST_PATTERNS:
+    """All combinations of sets, in each as many sensors as the budget allows; the first step's change fastest."""
+    choices = [turn.choice for turn in plans.turns[:-1]]
+    places = [ranks(choice.rows) for choice in choices]
+    widths = [int(place.max(initial=-1)) + 1 for place in places]
+    most = max(widths) if choices[0].budget is None else min(choices[0].budget, max(widths))
+    counts = [sum(math.comb(width, k) for k in range(most + 1)) for width in widths]
+    count = math.prod(counts)
+    if count > min(2**_MOST_BITS, _MOST_PATTERNS // plans.count) or max(widths) > 62:
         return None
-    count, bits = found
+    each_set = [
+        [
+            sum(1 << j for j in some)
+            for k in range(most + 1)
+            for some in combinations(range(width), k)
+        ]
+        for width in widths
+    ]
+    tables, turns = [np.array(each) for each in each_set], np.cumprod([1, *counts])
 
     def sets(numbers: IndexArray) -> list[BoolArray]:
         found = []
-        for t, turn in enumerate(plans.turns[:-1]):
-            on = (bits(t, numbers[turn.choice.rows]) & 1 > 0)[:, None]
-            allowed = turn.choice.allowed
-            found.append(on if allowed is None else on & allowed)
+        for t, choice in enumerate(choices):
+            bits = tables[t][numbers[choice.rows] // turns[t] % counts[t]]
+            on = (bits >> places[t] & 1 > 0)[:, None]
+            found.append(on if choice.allowed is None else on & choice.allowed)
         return found
 
     def of(number: int) -> _Tried:
-        report, price = [], []
-        for t, on in enumerate(sets(np.full(plans.layout.count, number)), start=1):
-            report.append(plans.turns[t - 1].choice.report(on)[:, 0])
-            price.append((plans.layout.pay[t - 1] @ on)[:, 0])
+        each = sets(np.full(plans.count, number))
+        report = [choice.report(on)[:, 0] for choice, on in zip(choices, each, strict=True)]
+        price = [(turn.pay @ on)[:, 0] for turn, on in zip(plans.turns, each, strict=False)]
         return report, price
 
     return _Choices(count, of, sets)
-
-
-_Bits: TypeAlias = Callable[[int, IndexArray], IndexArray]
-"""From a step and `[G]` numbers of choices to `[G]`; the last bit is whether the sensor of a decision is on."""
-
-
-def _all_sets(
-    owners: Sequence[IndexArray], places: Sequence[IndexArray]
-) -> tuple[int, _Bits] | None:
-    """A bit for each sensor of a row, those of later steps after those of earlier ones."""
-    shifts, before = [], np.zeros(max(int(owner.max(initial=-1)) for owner in owners) + 1, np.int64)
-    for owner, place in zip(owners, places, strict=True):
-        shifts.append(before[owner] + place)
-        before += np.bincount(owner, minlength=len(before))
-    bits = int(before.max(initial=0))
-    return (2**bits, lambda t, number: number >> shifts[t]) if bits <= _MOST_BITS else None
-
-
-def _small_sets(places: Sequence[IndexArray], budget: int) -> tuple[int, _Bits] | None:
-    """All combinations of sets of at most `budget` sensors, the first step's changing fastest."""
-    widths = [int(place.max(initial=-1)) + 1 for place in places]
-    budget = min(budget, max(widths))
-    counts = [sum(math.comb(width, k) for k in range(budget + 1)) for width in widths]
-    if math.prod(counts) > 2**_MOST_BITS or max(widths) > 62:
-        return None
-    tables = [
-        np.array([sum(1 << sensor for sensor in some) for some in _subsets(width, budget)])
-        for width in widths
-    ]
-    turns = np.cumprod([1, *counts])
-
-    def bits(t: int, number: IndexArray) -> IndexArray:
-        return tables[t][number // turns[t] % counts[t]] >> places[t]
-
-    return math.prod(counts), bits
-
-
-def _subsets(width: int, most: int) -> Iterator[tuple[int, ...]]:
-    """The subsets of 0 ... width - 1 with at most so many elements."""
-    return chain.from_iterable(combinations(range(width), k) for k in range(most + 1))
 
 
 def _of_patterns(plans: Plans, choice: Shared) -> _Choices | None:
@@ -168,7 +137,7 @@ def _of_patterns(plans: Plans, choice: Shared) -> _Choices | None:
     turn = plans.turns[0]
     number = ranks(turn.rows)
     bits = int(number.max(initial=0)) + 1
-    if plans.layout.count << bits > _MOST_PATTERNS:
+    if plans.count << bits > _MOST_PATTERNS:
         return None
     kept = choice.distinct(turn.price)
     cheapest = _cheapest(choice.some(kept), turn.price[kept], number, 2**bits)
@@ -208,13 +177,13 @@ def _cheapest(choice: Shared, price: Array, number: IndexArray, patterns: int) -
 
 def _earned(plans: Plans, tried: _Tried) -> tuple[Array, Array]:
     """`[K]` reward of the listed sets, and `[E]` the mass that they leave undetected."""
-    earned, mass = np.zeros(plans.layout.count), plans.mass[:, 0]
-    for t, (report, price) in enumerate(zip(*tried, strict=True), start=1):
-        now = plans.turns[t - 1].back @ mass
-        sums = plans.layout.sums[t]
-        inside = sums @ now
+    earned, mass = np.zeros(plans.count), plans.mass[:, 0]
+    steps = zip(plans.turns, plans.detected, *tried, strict=False)
+    for turn, detected, report, price in steps:
+        now = turn.back @ mass
+        inside = turn.sums @ now
         paid = np.where(inside > 0, price, 0.0) * inside  # an impossible set costs inf
-        earned += sums @ (now * report * plans.detected[t - 1][:, 0]) - paid
+        earned += turn.sums @ (now * report * detected[:, 0]) - paid
         mass = now * (1.0 - report)
     return earned, mass
 
@@ -222,12 +191,12 @@ def _earned(plans: Plans, tried: _Tried) -> tuple[Array, Array]:
 def _last(plans: Plans, mass: Array, hopeful: BoolArray) -> Array:
     """`[K]` the most that the best last set earns from `mass` `[E]`, of the rows that are `hopeful`."""
     turn, t = plans.turns[-1], plans.length
-    now = turn.back @ (mass * hopeful[plans.layout.rows[t - 1]])
+    now = turn.back @ (mass * hopeful[turn.before])
     missed = plans.missed[:, 0]
     gain = now * (plans.detected[t - 1][:, 0] - missed)
     price = plans.priced(t, now[:, None])[:, 0]
-    most: Array = plans.layout.sums[t] @ (now * missed)
-    return most + turn.choice.upper(gain, price)
+    most: Array = turn.sums @ (now * missed)
+    return most + turn.choice.cover(gain, price, exact=True).upper
 
 
 def _plans_of(

@@ -1,8 +1,4 @@
-"""Losses of cells left unsensed, against revealing the position at once: the bounds inside branch and bound.
-
-The loss is superadditive, so the joint loss of two cells, when both are left, bounds the loss of any set of undecided
-cells (`Losses._least`).
-"""
+"""Losses of cells left unsensed, against revealing the position at once: the bounds inside branch and bound."""
 
 from __future__ import annotations
 
@@ -12,13 +8,10 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.arrays.entries import per_row, row_index
-from trackmdp.arrays.types import Array, IndexArray
+from trackmdp.arrays.types import Array
 from trackmdp.solvers.certify.choices import Choices, Frontier
 from trackmdp.solvers.certify.inner import InnerProblem
 from trackmdp.solvers.certify.joint import Joint
-
-MOST_PAIRED = 10
-"""Cells of one state up to which every pair is looked at for a better bound."""
 
 
 class Losses:
@@ -34,11 +27,11 @@ class Losses:
         self._joint = Joint(problem.world, problem.detected, revealed)
 
     def looked_ahead(self, frontier: Frontier) -> Frontier:
-        """The states with where the target may go on to, and with the least losses that are to come."""
-        after = None
-        if self._world.perfect:
-            after = self._joint.next(frontier.cells, frontier.mass, frontier.present)
-        return replace(frontier, rest=self._least(frontier), after=after)
+        """The states with where the target may go on to."""
+        if not self._world.perfect:
+            return frontier
+        after = self._joint.next(frontier.cells, frontier.mass, frontier.present)
+        return replace(frontier, after=after)
 
     def of(self, choices: Choices) -> tuple[Array, Array]:
         """`[P]` joint loss of the cells left, `[P, K - k]` the addition of each undecided cell if it is left."""
@@ -92,42 +85,3 @@ class Losses:
         )
         leave = moved.data * missed
         return per_row(rows, np.maximum(sense, leave), mass.shape[0]), moved, sense, leave
-
-    def _least(self, frontier: Frontier) -> Array:
-        """`[B, K + 1]` lower bound on the loss against `relaxed` of the cells from the k-th on, however decided.
-
-        A cell sensed costs its regret. Two or more cells left unsensed lose, F being sublinear, at least the sum over
-        them of half the smallest loss of a pair with that cell. With one or none left, all others cost their regret.
-        """
-        count, width = len(frontier.start), frontier.cells.shape[1]
-        if not 2 <= width <= MOST_PAIRED:
-            return np.zeros((count, width + 1))
-        # pair[s, a, b]: joint loss of cells a and b of state s when both are left; infinite where one is padding
-        pair, present = np.full((count, width, width), np.inf), frontier.present
-        for shift in range(1, width):
-            state, place = np.nonzero(present[:, shift:])
-            lost = self._pair(frontier, state, place, place + shift)
-            pair[state, place, place + shift] = pair[state, place + shift, place] = lost
-        rest = np.zeros((count, width + 1))
-        for k in range(width):
-            # Each cell from the k-th on costs its regret, or is left together with another one. Averaging over all
-            # pairings of the cells left, cell a takes at least half of its cheapest pair's loss.
-            # That holds where two or more are left; with one or none, all the others cost their regret.
-            later = pair[:, k:, k:].min(axis=2)
-            regret = frontier.regret[:, k:]
-            # Why half, with n cells left: z_N is 1/(n-1) times the sum of its pairs, and the loss is superadditive and
-            # homogeneous, so loss(z_N) >= 1/(n-1) sum over pairs of loss(a, b) >= sum over a of min_b loss(a, b) / 2.
-            several = np.minimum(later / 2.0, regret).sum(axis=1)
-            # One cell left: all others cost their regret, at best all but the largest.
-            rest[:, k] = np.minimum(several, regret.sum(axis=1) - regret.max(axis=1))
-        return rest
-
-    def _pair(self, frontier: Frontier, state: IndexArray, a: IndexArray, b: IndexArray) -> Array:
-        cells = np.stack([frontier.cells[state, a], frontier.cells[state, b]], axis=1)
-        masses = np.stack([frontier.mass[state, a], frontier.mass[state, b]], axis=1)
-        # CSR rows of exactly two entries each: row p is entries 2p and 2p + 1.
-        pointer = np.arange(len(state) + 1) * 2
-        mass = sparse.csr_array(
-            (masses.ravel(), cells.ravel(), pointer), shape=(len(state), self._world.num_cells)
-        )
-        return self._loss(mass, frontier.sets_left - 1)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from collections import defaultdict
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -12,6 +12,7 @@ from scipy import sparse
 
 from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.solvers.motion_totals import summed_over
+from trackmdp.solvers.pomdp import Chain, reached
 from trackmdp.solvers.several.merging import Beliefs, Clocks, Rule
 from trackmdp.world.group import Group
 
@@ -24,23 +25,6 @@ Joint: TypeAlias = tuple[Known | None, ...]
 """What is known of every target; None of one that has left."""
 Outcome: TypeAlias = tuple[float, bool, Known | None]
 """Probability, whether it is a detection, and what is known then."""
-
-
-@dataclass(frozen=True)
-class Chain:
-    """All joint states that choices lead to, and their choices.
-
-    Attributes:
-        starts: number of joint states, the first ones, in which all targets have just been located.
-        owner: `[C]`, joint state of each choice.
-        totals: `[C, 6]`, expected figures of the step (`GroupEvaluation.totals`).
-        moves: `[C, states]`, probability of each joint state after it.
-    """
-
-    starts: int
-    owner: IndexArray
-    totals: Array
-    moves: sparse.csr_array
 
 
 def joint_chain(rule: Rule) -> Array | None:
@@ -68,11 +52,16 @@ def joint_chain(rule: Rule) -> Array | None:
         found = sparse.linalg.spsolve(sparse.csc_array(system), chain.totals)
     else:
         found = summed_over(chain.moves, chain.totals, group.task.max_steps)
-    return np.asarray(found[: chain.starts].mean(axis=0, keepdims=True))
+    starts = group.task.num_cells ** len(group)
+    return np.asarray(found[:starts].mean(axis=0, keepdims=True))
 
 
-def explored(group: Group, choices: Callable[[Joint], list[IndexArray]], most: int) -> Chain | None:
-    """The joint states reached from all starts; None where there are more than `most`.
+def explored(
+    group: Group, choices: Callable[[Joint], list[IndexArray]], most: int
+) -> Chain[Joint] | None:
+    """The joint states reached from all starts, which are the first; None where there are more than `most`.
+
+    The totals of a choice, `[6]`, are the expected figures of the step (`GroupEvaluation.totals`).
 
     Args:
         group: the targets.
@@ -81,30 +70,18 @@ def explored(group: Group, choices: Callable[[Joint], list[IndexArray]], most: i
     """
     cells, kinds = group.task.num_cells, group.kind
     starts = itertools.product(*(range(kind * cells, (kind + 1) * cells) for kind in kinds))
-    joint: list[Joint] = [tuple((z, 0, ((z, 1.0),)) for z in each) for each in starts]
-    number, first = {each: place for place, each in enumerate(joint)}, len(joint)
-    owner, totals = list[int](), list[Array]()
-    rows, columns, chances = list[int](), list[int](), list[float]()
-    # The list grows while it is gone through.
-    for place, known in enumerate(joint):
-        forced = any(each and each[1] > group.task.t_max for each in known)
-        for on in [np.arange(0)] if forced else choices(known):
-            total = np.zeros(6)
-            for chance, after, figures in _steps(group, known, set(on.tolist()), forced):
+
+    def followed(joint: Joint) -> Iterator[tuple[Array, dict[Joint, float]]]:
+        forced = any(each and each[1] > group.task.t_max for each in joint)
+        for on in [np.arange(0)] if forced else choices(joint):
+            total, moves = np.zeros(6), defaultdict[Joint, float](float)
+            for chance, after, figures in _steps(group, joint, set(on.tolist()), forced):
                 total += chance * figures
                 if any(after):
-                    if after not in number:
-                        number[after] = len(joint)
-                        joint.append(after)
-                    rows.append(len(owner))
-                    columns.append(number[after])
-                    chances.append(chance)
-            owner.append(place)
-            totals.append(total)
-        if len(joint) > most:
-            return None
-    moves = sparse.csr_array((chances, (rows, columns)), shape=(len(owner), len(joint)))
-    return Chain(first, np.array(owner), np.array(totals), moves)
+                    moves[after] += chance
+            yield total, moves
+
+    return reached([tuple((z, 0, ((z, 1.0),)) for z in each) for each in starts], followed, most)
 
 
 def _steps(

@@ -31,6 +31,7 @@ from trackmdp.policies.saved import packed
 from trackmdp.policies.table import PolicyTable
 from trackmdp.sensing.choose import largest
 from trackmdp.solvers.renewal import Renewal
+from trackmdp.solvers.search import Found
 from trackmdp.world.group import Group
 
 
@@ -224,12 +225,10 @@ class Merged(Rule):
         # Plans are those of whole episodes, also where these are cut off.
         for kind, (world, table) in enumerate(zip(self.group.kinds, self.tables, strict=True)):
             renewal = Renewal(world, world.motion)
-            sets = renewal.sets(table)
-            system, earned = renewal.system(sets)
-            value = system.solve(earned)
+            policy = Found(renewal, renewal.sets(table))
             # Behind the cells stand those in which the safe action has missed, if it does.
-            values.append(value[: self.cells])
-            after = renewal.problem(value).after(sets)
+            values.append(policy.value[: self.cells])
+            after = policy.plans().after(policy.sets)
             for step, worth, (codes, found) in zip(renewal.steps, after, worths, strict=False):
                 located, state = step.rows + kind * self.cells, step.states + kind * self.cells
                 codes.append(located.astype(np.int64) * states + state)
