@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from tests.episodes.logs import policy, recorded, write
+from tests.episodes.logs import WORLD, policy, recorded, write
 from tests.helpers import limited
 from trackmdp.episodes import grids
 from trackmdp.episodes.differences import first_difference
 from trackmdp.episodes.grids import WHOLE_CELLS
 from trackmdp.episodes.layouts import layout
 from trackmdp.episodes.reader import EpisodeReader
-from trackmdp.episodes.schema import SCHEMAS
+from trackmdp.episodes.schema import schemas_of
 from trackmdp.episodes.simulate import simulate
 from trackmdp.motion.kernels import random_walk
 from trackmdp.policies.policy import Policy
@@ -179,12 +179,12 @@ def test_a_grid_that_lies_outside_is_damage(place: dict[str, Any]) -> None:
             grids.read_grids([json.dumps(wrong).encode()], WALK.size)
 
 
-@pytest.mark.parametrize("topic", SCHEMAS)
+@pytest.mark.parametrize("topic", schemas_of(WORLD))
 def test_every_message_is_what_its_schema_says(log: Path, topic: str) -> None:
     found = messages(log, topic)
     assert found
     for said in found:
-        check_json(said, SCHEMAS[topic][1], topic)
+        check_json(said, schemas_of(WORLD)[topic][1], topic)
 
 
 def check_json(value: Any, schema: dict[str, Any], place: str) -> None:

@@ -25,9 +25,10 @@ from trackmdp.episodes.grids import (
     stamp_of,
 )
 from trackmdp.episodes.messages import Form
-from trackmdp.episodes.schema import LoggedRun, belief_topic, clock_of, json_bytes
+from trackmdp.episodes.schema import belief_topic, clock_of, json_bytes
 from trackmdp.episodes.target_colours import shares_of
-from trackmdp.sensing.coverage import Coverage
+from trackmdp.world.group import Group
+from trackmdp.world.problem import Problem
 
 _BELIEF = np.dtype([("belief", "<f4")])
 _SAYS, _ACTIVE_SAYS = constant(_BELIEF), constant(ACTIVE)
@@ -37,9 +38,9 @@ _FAINT = 0.4
 """Opacity of a target that was missed."""
 
 
-def form_of(run: LoggedRun, coverage: Coverage | None = None) -> Form:
+def form_of(problem: Problem | Group) -> Form:
     """The form of the episodes of a log, of one target or of several; see `Form`."""
-    return (GroupForm if run.kinds else Form)(run, coverage)
+    return (GroupForm if problem.targets else Form)(problem)
 
 
 class GroupForm(Form):
@@ -48,11 +49,11 @@ class GroupForm(Form):
     @property
     def read_layers(self) -> Sequence[str]:
         """See `Form`."""
-        return [belief_topic(target) for target in range(len(self.run.kinds))]
+        return [belief_topic(target) for target in range(len(self.problem.targets))]
 
     def layers(self, episode: Episode, first_tick: int) -> Iterator[dict[str, bytes]]:
         """See `Form`."""
-        (rows, columns), targets = self.run.size, len(episode.start)
+        (rows, columns), targets = self.task.size, len(episode.start)
         sensed = episode.action.reshape(-1, rows, columns)
         for t, active in enumerate(boxes_of(sensed)):
             stamp = stamp_of(first_tick + t)
@@ -71,9 +72,9 @@ class GroupForm(Form):
 
     def _scene(self, episode: Episode, t: int, tick: int) -> bytes:
         """The targets that are in the grid, in place of those of the step before."""
-        rows, columns = self.run.size
+        rows, columns = self.task.size
         time, entities = clock_of(tick), []
-        for k in np.flatnonzero(episode.target[t] < self.run.cells).tolist():
+        for k in np.flatnonzero(episode.target[t] < self.task.num_cells).tolist():
             row, column = divmod(int(episode.target[t, k]), columns)
             place = {"x": column + 0.5, "y": rows - row - 0.5}
             colour = dict(zip("rgb", shares_of(k), strict=True))
@@ -89,12 +90,12 @@ class GroupForm(Form):
 
     def _beliefs(self, mine: dict[str, list[bytes]]) -> dict[str, Any]:
         """See `Form`: `[T · K, M]` of the messages of each target."""
-        run, topics = self.run, self.read_layers
-        places = np.arange(run.cells).reshape(run.size)
+        task, topics = self.task, self.read_layers
+        places = np.arange(task.num_cells).reshape(task.size)
         rows, columns, masses = [], [], []
         for k, topic in enumerate(topics):
             for t, text in enumerate(mine[topic]):
-                part, cells = read_grid(text, run.size, _BELIEF)
+                part, cells = read_grid(text, task.size, _BELIEF)
                 mass, cell = cells["belief"].ravel(), places[part].ravel()
                 some = np.flatnonzero(mass)
                 rows.append(np.full(len(some), t * len(topics) + k))
@@ -102,7 +103,7 @@ class GroupForm(Form):
                 masses.append(mass[some])
         entries = np.concatenate(masses), (np.concatenate(rows), np.concatenate(columns))
         steps = len(mine[topics[0]])
-        return {"belief": sparse.csr_array(entries, shape=(steps * len(topics), run.cells))}
+        return {"belief": sparse.csr_array(entries, shape=(steps * len(topics), task.num_cells))}
 
 
 def _at(place: Mapping[str, float], height: float, **more: Any) -> dict[str, Any]:

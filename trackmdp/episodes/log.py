@@ -63,7 +63,7 @@ class EpisodeLog:
                 facts = {"seed": str(seed)}
                 self._writer = EpisodeWriter.of(self.file, world, facts=facts, config=config)
             if layout:
-                write_layout(folder / "episodes.layout.json", self._writer.run)
+                write_layout(folder / "episodes.layout.json", world)
 
     @property
     def part(self) -> Path:

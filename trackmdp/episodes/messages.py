@@ -11,21 +11,21 @@ import numpy as np
 from trackmdp.episodes.container import Said
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.grids import grid_messages, read_grids
-from trackmdp.episodes.schema import LoggedRun, json_bytes, tick_of, time_of
+from trackmdp.episodes.schema import json_bytes, modes_of, tick_of, time_of
 from trackmdp.errors import UserError
-from trackmdp.sensing.coverage import Coverage
+from trackmdp.world.group import Group
+from trackmdp.world.problem import Problem
 
 
 class Form:
     """The form of the episodes of one target; see `trackmdp.episodes.group_messages` for several.
 
     Args:
-        run: the log.
-        coverage: of its sensors; None where each sees its own cell.
+        problem: where the episodes took place.
     """
 
-    def __init__(self, run: LoggedRun, coverage: Coverage | None = None) -> None:
-        self.run, self._coverage = run, coverage
+    def __init__(self, problem: Problem | Group) -> None:
+        self.problem, self.task = problem, problem.single
 
     @property
     def read_layers(self) -> Sequence[str]:
@@ -46,7 +46,7 @@ class Form:
             "length": len(episode),
             "return": float(episode.returns[-1]),
             "detections": int(episode.located.sum()),
-            "forced": int(episode.forced(self.run.t_max).sum()),
+            "forced": int(episode.forced(self.task.t_max).sum()),
             "terminated": episode.terminated,
             "truncated": episode.truncated,
             "start_time": str(time_of(first_tick)),
@@ -55,8 +55,8 @@ class Form:
 
     def steps(self, episode: Episode) -> Iterator[bytes]:
         """The `/step` messages; of several targets with a number of each in the place of one."""
-        (rows, columns), t = self.run.size, np.arange(len(episode))
-        there = episode.target < self.run.cells
+        (rows, columns), t = self.task.size, np.arange(len(episode))
+        there = episode.target < self.task.num_cells
         steps, ids = np.nonzero(episode.action)
         # np.nonzero lists (step, sensor) in order of steps: steps 0 0 1 3 with sensors 2 5 4 0. searchsorted finds
         # where steps 1, 2, 3 begin, 2 3 3, and split makes of those [2 5] [4] [] [0].
@@ -69,7 +69,7 @@ class Form:
             "last_cell": self._written(episode.last_cell),
             "active": active,
             "n_active": episode.action.sum(axis=1),
-            "forced": episode.forced(self.run.t_max),
+            "forced": episode.forced(self.task.t_max),
             "target": self._written(episode.target),
             "target_x": np.where(there, episode.target % columns, -1),
             # Cells are numbered from the top left, a plot's y axis points upwards: in 3 rows of 4, cell 5 is at x = 1,
@@ -90,12 +90,13 @@ class Form:
 
     def _written(self, cells: Any) -> Any:
         """Cells with -1 for none, which is M in an episode: a schema with null is refused by viewers, topic and all."""
-        return np.where(cells == self.run.cells, -1, cells)
+        return np.where(cells == self.task.num_cells, -1, cells)
 
     def layers(self, episode: Any, first_tick: int) -> Iterator[dict[str, bytes]]:
         """Of each step topic -> message, for viewers."""
-        covered = None if self._coverage is None else self._coverage.cells(episode.action)
-        return grid_messages(episode, self.run.size, first_tick, covered)
+        coverage = self.task.coverage
+        covered = None if coverage is None else coverage.cells(episode.action)
+        return grid_messages(episode, self.task.size, first_tick, covered)
 
     def decode(self, row: dict[str, Any], messages: Iterable[Said]) -> Episode:
         """The episode of a row, from messages among which are its own.
@@ -120,7 +121,7 @@ class Form:
         self, row: dict[str, Any], said: list[dict[str, Any]], mine: dict[str, list[bytes]]
     ) -> Episode:
         """The episode of a row, the contents of its steps, and its messages by topic."""
-        run, targets = self.run, len(self.run.kinds)
+        task, targets, has_mode = self.task, len(self.problem.targets), modes_of(self.problem) > 1
         misses, target, seen = (
             np.array([each[name] for each in said], dtype=np.int64)
             for name in ("n", "target", "obs")
@@ -130,11 +131,11 @@ class Form:
             each.shape != (len(said), *shape) for each in (misses, target, seen)
         ):
             raise ValueError(f"steps or starts of other than {targets or 1} targets")
-        action = np.zeros((len(said), run.sensors), dtype=bool)
+        action = np.zeros((len(said), task.total_sensors), dtype=bool)
         for t, each in enumerate(said):
             action[t, each["active"]] = True
-        start = np.where(start < 0, run.cells, start)
-        modes = np.array([each["mode"] for each in said], dtype=np.int64) if run.modes else None
+        start = np.where(start < 0, task.num_cells, start)
+        modes = np.array([each["mode"] for each in said], dtype=np.int64) if has_mode else None
         return Episode(
             number=row["episode"],
             seed=int(row["seed"]),
@@ -142,16 +143,16 @@ class Form:
             start=start if targets else int(start),
             misses=misses,
             action=action,
-            target=np.where(target < 0, run.cells, target),
+            target=np.where(target < 0, task.num_cells, target),
             located=seen >= 0,
             reward=np.array([each["reward"] for each in said], dtype=np.float32),
             mode=modes,
             first_tick=tick_of(int(row["start_time"])),
-            start_mode=row["start_mode"] if run.modes else 0,
+            start_mode=row["start_mode"] if has_mode else 0,
             **self._beliefs(mine),
         )
 
     def _beliefs(self, mine: dict[str, list[bytes]]) -> dict[str, Any]:
         """Beliefs and probabilities of an episode, from its messages by topic."""
-        belief, probability = read_grids(mine["/grid"], self.run.size)
+        belief, probability = read_grids(mine["/grid"], self.task.size)
         return {"belief": belief, "probability": probability}

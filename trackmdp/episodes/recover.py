@@ -14,8 +14,7 @@ from mcap.records import Attachment, Chunk, DataEnd, Metadata
 
 from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged, Said
-from trackmdp.episodes.group_messages import form_of
-from trackmdp.episodes.schema import TABLES, LoggedRun
+from trackmdp.episodes.schema import TABLES
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
 from trackmdp.untrusted import reason
@@ -102,7 +101,7 @@ def _rewrite(
                     break
                 _add_policies(writer, parts, row["policy"] + 1)
                 # Messages of another episode may be held as well, one with an end that was lost.
-                writer.add(form_of(writer.run).decode(row, held))
+                writer.add(writer.form.decode(row, held))
             held.clear()
         writer = writer or _begin(file, target, parts, damaged)
     if held or schema.END not in parts.metadata:
@@ -149,11 +148,12 @@ def _messages(stream: BinaryIO, parts: _Parts, damaged: list[str]) -> Iterator[S
 def _begin(file: Path, target: Path, parts: _Parts, damaged: list[str]) -> EpisodeWriter | None:
     """The new log, if all that it begins with has been found."""
     if schema.RUN in parts.metadata:
-        run = LoggedRun(file, parts.metadata[schema.RUN])
+        said = parts.metadata[schema.RUN]
+        schema.check_format(file, said)
         with _noting(damaged):
             # Without the problem, the log could not be simulated again.
-            tables = {n: parts.attached(n, run.said.get(f"{n}.sha256")) for n in TABLES}
-            return EpisodeWriter(target, run, tables)
+            tables = {n: parts.attached(n, said.get(f"{n}.sha256")) for n in TABLES}
+            return EpisodeWriter(target, said, tables)
     return None
 
 
@@ -162,6 +162,6 @@ def _add_policies(writer: EpisodeWriter, parts: _Parts, count: int) -> None:
     # One after another: the number of a policy is its place.
     for each in range(writer.policies, count):
         facts = parts.metadata[f"{schema.POLICY}.{each}"]
-        tables = [parts.attached(*it) for it in writer.run.policy_tables(each, facts).items()]
+        tables = [parts.attached(*it) for it in schema.policy_tables(each, facts).items()]
         writer.flush()  # as when it was recorded, so that a copy has the same bytes
         writer.copy_policy(facts, tables)

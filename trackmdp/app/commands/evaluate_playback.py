@@ -26,10 +26,11 @@ def evaluate_playback(
     Such a policy ignores its observations, so that it has no table and no exact value.
     """
     with EpisodeReader(chosen.file) as reader:
-        if reader.run.size != world.size:
-            recorded = f"baseline.file={chosen.file}: recorded on {grid_words(reader.run.size)}"
+        own = reader.world()
+        if own.single.size != world.size:
+            recorded = f"baseline.file={chosen.file}: recorded on {grid_words(own.single.size)}"
             raise UserError(f"{recorded}, expected grid.size of {grid_words(world.size)}")
-        if reader.run.kinds:
+        if own.targets:
             raise UserError(f"baseline.file={chosen.file}: of several targets, expected one")
         logged = reader.read(chosen.episode)
     actions = Playback(world, logged.action)
