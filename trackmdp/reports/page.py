@@ -95,29 +95,24 @@ def build(
     caption = "Runs that are missing or differ from the others"
     lost = [[anomaly.run, anomaly.text] for anomaly in results.anomalies]
     table = Table("missing", caption, [Column("run"), Column("reason")], lost)
-    missing = [Section("missing", "Missing runs", [table])]
+    missing = Section("missing", "Missing runs", [table] if lost else [])
     if not results.runs:
-        return Report(_about(results), missing)
+        return Report(_about(results), [missing])
     say("figures")
     grouped = study(results.runs)
     sections = [
         Section("outcome", "Outcome", _outcome(grouped, threshold)),
-        *(missing if results.anomalies else []),
-        *_section("idea", "Why few sensors are enough", _story(results.maps)),
-        *_section("prices", "Against the price of a sensor", _prices(grouped, threshold)),
-        *_section("learning", "Learning", _learning(grouped, threshold)),
-        *_section("maps", "Policies, cell by cell", _maps(results.maps)),
+        missing,
+        Section("idea", "Why few sensors are enough", _story(results.maps)),
+        Section("prices", "Against the price of a sensor", _prices(grouped, threshold)),
+        Section("learning", "Learning", _learning(grouped, threshold)),
+        Section("maps", "Policies, cell by cell", _maps(results.maps)),
         *extra,
         Section("runs", "All runs", _runs(grouped, threshold)),
         Section("words", "Words", [_facts(paragraphs("trackmdp.reports", "words.txt"))]),
         Section("made", "How it was made", [_facts(_made(results.manifest))]),
     ]
-    return Report(_about(results), sections)
-
-
-def _section(anchor: str, heading: str, parts: Sequence[Part]) -> list[Section]:
-    """A section, unless it is empty."""
-    return [Section(anchor, heading, parts)] if parts else []
+    return Report(_about(results), [each for each in sections if each.parts])
 
 
 def _part(part: Part) -> str:
