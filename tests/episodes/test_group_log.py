@@ -20,7 +20,7 @@ from trackmdp.episodes.belief_filter import beliefs
 from trackmdp.episodes.differences import first_difference
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.group_episodes import GroupEpisodes
-from trackmdp.episodes.group_messages import form_of
+from trackmdp.episodes.messages import form_of
 from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
 from trackmdp.episodes.simulate import resimulate

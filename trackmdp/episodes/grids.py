@@ -34,7 +34,7 @@ Box: TypeAlias = tuple[int, int, int, int]
 """Top, bottom, left and right, ends excluded."""
 
 _CELL = np.dtype([("belief", "<f4"), ("policy", "<f4")])
-ACTIVE, _TARGET = np.dtype([("active", "u1")]), np.dtype([("target", "u1")])
+_ACTIVE, _TARGET = np.dtype([("active", "u1")]), np.dtype([("target", "u1")])
 _TYPES = {np.dtype("<f4"): 7, np.dtype("u1"): 1}  # foxglove.NumericType
 
 
@@ -54,7 +54,7 @@ def constant(cell: np.dtype[Any], side: float = 1) -> bytes:
 
 
 _GRID_SAYS = constant(_CELL)
-_ACTIVE_SAYS = constant(ACTIVE)
+ACTIVE_SAYS = constant(_ACTIVE)
 _TARGET_SAYS = constant(_TARGET, side=0.5)
 
 _DOT = np.array([[[1]], [[0]]], np.uint8)
@@ -62,11 +62,11 @@ _DOT = np.array([[[1]], [[0]]], np.uint8)
 
 
 def grid_messages(
-    episode: Episode, size: tuple[int, int], first_tick: int, covered: BoolArray | None = None
+    episode: Episode, size: tuple[int, int], first_tick: int, covered: BoolArray
 ) -> Iterator[dict[str, bytes]]:
     """Of each step topic -> message, a layer above the other in this order, and where viewers look.
 
-    `covered` `[T, M]` are the cells that the sensors on see; None where each sees its own.
+    `covered` `[T, M]` are the cells that the sensors on see.
     """
     rows, columns = size
     exited = (episode.target == rows * columns).astype(int).tolist()
@@ -76,7 +76,7 @@ def grid_messages(
         stamp, (row, column), (y, x) = stamp_of(first_tick + t), at[t], parts[t]
         yield {
             "/grid": boxed(stamp, _GRID_SAYS, cells, box, 0),
-            "/active": boxed(stamp, _ACTIVE_SAYS, active, around, 0.01),
+            "/active": boxed(stamp, ACTIVE_SAYS, active, around, 0.01),
             # half as wide as its cell, so that the layers beneath it show: in column 3 from x = 3.25 to 3.75
             "/target": grid_text(
                 stamp, _TARGET_SAYS, _DOT[exited[t]], column + 0.25, rows - row - 0.75, 0.02
@@ -86,15 +86,14 @@ def grid_messages(
 
 
 def _layers(
-    episode: Episode, size: tuple[int, int], covered: BoolArray | None
+    episode: Episode, size: tuple[int, int], covered: BoolArray
 ) -> Iterator[tuple[AnyArray, Box, AnyArray, Box]]:
     """Of each step belief and policy `[R, C]`, and the cells sensed, each with the box to be written."""
     # A few steps at a time: of all steps together they would take 12 bytes for each step and cell.
     each = max(1, _AT_ONCE // math.prod(size))
-    active = episode.action if covered is None else covered
     for begin in range(0, len(episode), each):
         some = slice(begin, begin + each)
-        sensed = active[some].reshape(-1, *size)
+        sensed = covered[some].reshape(-1, *size)
         cells = np.zeros(sensed.shape, _CELL)
         cells["belief"] = episode.belief[some].reshape(cells.shape)
         cells["policy"] = episode.probability[some].reshape(cells.shape)

@@ -21,8 +21,7 @@ from trackmdp.durable import write_text
 from trackmdp.episodes.grids import PART
 from trackmdp.episodes.schema import belief_topic
 from trackmdp.episodes.target_colours import COLOURS, colour_of
-from trackmdp.world.group import Group
-from trackmdp.world.problem import Problem
+from trackmdp.world.group import Subject
 
 
 def layout(size: tuple[int, int], targets: int = 1) -> dict[str, Any]:
@@ -90,7 +89,7 @@ def _lines(size: tuple[int, int]) -> list[dict[str, Any]]:
     return [same | {"position": [x, y, 0.005]} for y, x in corners]
 
 
-def write_layout(file: Path, problem: Problem | Group) -> None:
+def write_layout(file: Path, problem: Subject) -> None:
     """Write the layout of a log as JSON."""
     made = layout(problem.single.size, max(len(problem.targets), 1))
     write_text(file, json.dumps(made, indent=2) + "\n")

@@ -17,7 +17,7 @@ from trackmdp.config import train_config_of
 from trackmdp.episodes import schema
 from trackmdp.episodes.container import Container, Damaged, reading
 from trackmdp.episodes.differences import first_difference
-from trackmdp.episodes.group_messages import form_of
+from trackmdp.episodes.messages import form_of
 from trackmdp.episodes.schema import versions_apart
 from trackmdp.episodes.simulate import resimulate
 from trackmdp.errors import UserError

@@ -15,8 +15,7 @@ from typing import Any
 
 from trackmdp import __version__
 from trackmdp.errors import UserError
-from trackmdp.world.group import Group
-from trackmdp.world.problem import Problem
+from trackmdp.world.group import Subject
 from trackmdp.world.problem_file import PROBLEM, subject_in
 
 LOG_FORMAT = "5"
@@ -64,7 +63,7 @@ def belief_topic(target: int) -> str:
     return _BELIEF.format(target)
 
 
-def schemas_of(problem: Problem | Group) -> dict[str, tuple[str, dict[str, Any]]]:
+def schemas_of(problem: Subject) -> dict[str, tuple[str, dict[str, Any]]]:
     """Topic -> (name of its schema, JSON schema) of a log of `problem`."""
     targets, found = problem.targets, {}
     for topic, (name, title) in _LISTED["topics"]["several" if targets else "one"].items():
@@ -152,12 +151,12 @@ def policy_tables(number: int, facts: Mapping[str, str]) -> dict[str, str]:
     return {policy_file(number, kind): facts[table_digest(kind)] for kind in kinds}
 
 
-def modes_of(problem: Problem | Group) -> int:
+def modes_of(problem: Subject) -> int:
     """H; 1 where targets have no modes."""
     return getattr(problem.single, "modes", 1)
 
 
-def shape_of(problem: Problem | Group) -> dict[str, str]:
+def shape_of(problem: Subject) -> dict[str, str]:
     """The entries of `trackmdp.run` on the grid, the targets and T_max, for readers without this package."""
     task, modes = problem.single, modes_of(problem)
     return {
@@ -183,7 +182,7 @@ def check_format(file: Path, said: Mapping[str, str]) -> None:
         )
 
 
-def logged_problem(said: Mapping[str, str], content: bytes) -> Problem | Group:
+def logged_problem(said: Mapping[str, str], content: bytes) -> Subject:
     """The problem in a log's `problem.npz`; call it inside `untrusted.decoded`.
 
     Raises:

@@ -17,8 +17,7 @@ from trackmdp.environment.paths import PathSampler, path_sampler
 from trackmdp.episodes.actors import Actor, States, actor_of
 from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.episode_draws import Columns, Draws, joined, narrow, uniform
-from trackmdp.episodes.group_episodes import GroupEpisodes
-from trackmdp.episodes.group_simulate import group_columns
+from trackmdp.episodes.group_episodes import GroupEpisodes, batches
 from trackmdp.errors import UserError
 from trackmdp.machine import check_free
 from trackmdp.policies.acting import Playback
@@ -29,7 +28,7 @@ from trackmdp.solvers.evaluate import group_rule
 from trackmdp.solvers.several.merging import Rule
 from trackmdp.solvers.solve import named_policy
 from trackmdp.solvers.value import check_revealed
-from trackmdp.world.group import Group, check_problem
+from trackmdp.world.group import Group, Subject, check_problem
 from trackmdp.world.problem import Problem
 
 
@@ -55,7 +54,7 @@ def simulate(
 
 
 def simulate(
-    problem: Problem | Group,
+    problem: Subject,
     policy: PolicyLike | Playback | Rule,
     episodes: int,
     *,
@@ -115,16 +114,15 @@ def episode_seeds(seed: int, episodes: int, *names: str | int) -> list[int]:
 
 
 @torch.no_grad()
-def resimulate(
-    problem: Problem | Group, policy: PolicyLike | Playback | Rule, seeds: Sequence[int]
-) -> Any:
+def resimulate(problem: Subject, policy: PolicyLike | Playback | Rule, seeds: Sequence[int]) -> Any:
     """`Episodes` or `GroupEpisodes`: one episode for each of `seeds`, in their order, each independent of the others.
 
     See `simulate`.
     """
     if isinstance(policy, Rule):
         # Of no episode one is simulated, as below.
-        return GroupEpisodes.of(policy.group, policy, seeds, group_columns(policy, seeds or [0]))
+        columns = [each.run() for each in batches(policy, seeds or [0])]
+        return GroupEpisodes.of(policy.group, policy, seeds, columns)
     assert not isinstance(problem, Group)
     outcomes, sampler = Outcomes(problem), path_sampler(problem, held_out=True)
     actor = actor_of(problem.task, policy, Costs(problem))

@@ -14,14 +14,13 @@ from trackmdp.arrays.files import npz_bytes
 from trackmdp.durable import create, sync, sync_folder
 from trackmdp.episodes import schema
 from trackmdp.episodes.episode import Episode
-from trackmdp.episodes.group_messages import form_of
+from trackmdp.episodes.messages import form_of
 from trackmdp.episodes.schema import time_of
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import packed
 from trackmdp.solvers.several.merging import Rule
 from trackmdp.untrusted import decoded
-from trackmdp.world.group import Group
-from trackmdp.world.problem import Problem
+from trackmdp.world.group import Group, Subject
 from trackmdp.world.problem_file import PROBLEM, problem_bytes
 
 FLUSH_STEPS = 100
@@ -42,7 +41,7 @@ class EpisodeWriter:
 
     @classmethod
     def of(
-        cls, file: Path, problem: Problem | Group, *, facts: Mapping[str, str], config: str
+        cls, file: Path, problem: Subject, *, facts: Mapping[str, str], config: str
     ) -> EpisodeWriter:
         """A log of `problem`, of recorded tracks those held out.
 
@@ -55,11 +54,11 @@ class EpisodeWriter:
         Raises:
             UserError: the problem is too large for a log.
         """
-        logged, several = problem, isinstance(problem, Group)
+        logged = problem
         if (own := problem.recorded) is not None:
             judged = own.held_out
             # Those to learn from predict the moves of several targets.
-            tracks = own.tracks if several else judged
+            tracks = own.tracks if problem.targets else judged
             own = replace(own, tracks=tracks, validation=judged, loaded={})
             logged = replace(problem, recorded=own) if isinstance(problem, Group) else own
         tables = {schema.TABLES[0]: config.encode(), PROBLEM: problem_bytes(logged)}
@@ -138,14 +137,6 @@ class EpisodeWriter:
         """
         tick = self._tick if episode.first_tick is None else episode.first_tick
         row = self.form.row(episode, tick)
-        self._add_messages(episode, tick, row)
-        self._rows.append(row)
-        self._tick = tick + len(episode) + schema.GAP
-        self._unflushed += len(episode)
-        if self._unflushed >= FLUSH_STEPS:
-            self.flush()
-
-    def _add_messages(self, episode: Episode, tick: int, row: dict[str, Any]) -> None:
         # Before the first message of the episode: NaN is no JSON, and a time that does not fit into its field makes
         # the Writer raise within a chunk, which finish() could then no longer write.
         if not (np.isfinite(episode.reward).all() and 0 <= tick < 2**37):
@@ -159,8 +150,12 @@ class EpisodeWriter:
             time, sequence = time_of(place), place & 0xFFFFFFFF
             for topic, text in ({"/step": said} | layers).items():
                 add(channels[topic], time, text, time, sequence)
-        text = schema.json_bytes(row)
-        add(channels["/episode"], time, text, time, sequence)
+        add(channels["/episode"], time, schema.json_bytes(row), time, sequence)
+        self._rows.append(row)
+        self._tick = tick + len(episode) + schema.GAP
+        self._unflushed += len(episode)
+        if self._unflushed >= FLUSH_STEPS:
+            self.flush()
 
     def flush(self) -> None:
         """Close the chunk and hand it to the operating system: it then survives a kill of this process."""
