@@ -13,13 +13,13 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from trackmdp.arrays.types import AnyArray, Array, BoolArray, Indices
+from trackmdp.arrays.types import BoolArray, Indices
 from trackmdp.durable import write_text
 from trackmdp.episodes.belief_filter import beliefs
 from trackmdp.episodes.episode import Episode, Floats
 from trackmdp.episodes.episode_draws import Columns
 from trackmdp.episodes.grids import check_layers
-from trackmdp.episodes.simulated_figures import Simulation, simulation
+from trackmdp.episodes.simulated_figures import Simulation, mean_ratio
 from trackmdp.errors import UserError, output_of
 from trackmdp.notebook.card import Card, Carded, decimal, grid_words, percent
 from trackmdp.policies.policy import Policy
@@ -169,26 +169,25 @@ class Episodes(Carded, Sequence[Episode]):
 
     def figures(self) -> Simulation:
         """The policy's figures from the episodes, with standard errors."""
-        if not len(self):
-            return simulation(np.zeros((6, 0)))
         in_grid = self.target < self.problem.num_cells
         forced = (self.misses > self.problem.t_max) & in_grid
         # Sensors are counted where they cost: not at the exit, nor where the safe action replaced them.
         chosen = self.sensors * (in_grid & ~forced)
-        every = np.ones(len(self.target))
-        columns: list[AnyArray] = [
-            self.reward,
-            in_grid,
-            self.located,
-            chosen,
-            forced,
-            every,
-        ]
+        steps = np.ones(len(self.target))
+        columns = (self.reward, in_grid, self.located, chosen, forced, steps)
         # Every episode has a step, so that no two of `first` are the same and each sum belongs to one episode.
-        totals: Array = np.stack(
-            [np.add.reduceat(column.astype(np.float64), self.first[:-1]) for column in columns]
+        reward, inside, detections, sensors, safe, length = (
+            np.add.reduceat(column.astype(np.float64), self.first[:-1]) for column in columns
         )
-        return simulation(totals)
+        every = np.ones(len(self))
+        return Simulation(
+            episodes=len(self),
+            aihtr=mean_ratio(reward, every),
+            accuracy=mean_ratio(detections, inside),
+            sensors_per_step=mean_ratio(sensors, inside),
+            safe_per_episode=mean_ratio(safe, every),
+            expected_length=mean_ratio(length, every),
+        )
 
     @property
     def _at_once(self) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -150,17 +149,20 @@ class _Batch:
 
     def beliefs(self) -> Iterator[sparse.csr_array]:
         """`[T · K, M]`, predicted in each step of each episode; see `Episode`."""
-        steps = [(step.row, step.moved) for step in self._steps()]
-        episodes, targets = self._shape
-        lengths = np.bincount(np.concatenate([row for row, _ in steps]), minlength=episodes)
-        for number, length in enumerate(lengths.tolist()):
-            first, rows, columns, masses = number * targets, list[Any](), list[Any](), list[Any]()
-            for t, (_, moved) in enumerate(steps[:length]):
-                mine = slice(*np.searchsorted(moved.row, [first, first + targets]))
-                rows.append(moved.row[mine] - first + t * targets)
-                columns.append(moved.state[mine] % self._task.num_cells)
-                masses.append(moved.mass[mine].astype(np.float32))
-            entries = np.concatenate(masses), (np.concatenate(rows), np.concatenate(columns))
-            belief = sparse.csr_array(entries, shape=(length * targets, self._task.num_cells))
+        (episodes, targets), cells = self._shape, self._task.num_cells
+        taken, rows = list[Columns](), list[IndexArray]()
+        for t, step in enumerate(self._steps()):
+            moved = step.moved
+            episode, target = np.divmod(moved.row, targets)
+            place, mass = target + t * targets, moved.mass.astype(np.float32)
+            state = moved.state % cells
+            taken.append({"row": episode, "place": place, "cell": state, "mass": mass})
+            rows.append(step.row)
+        columns, counts = joined(taken)
+        lengths = np.bincount(np.concatenate(rows), minlength=episodes).tolist()
+        ends = np.cumsum(counts)[:-1]
+        parts = (np.split(columns[name], ends) for name in ("place", "cell", "mass"))
+        for place, cell, mass, length in zip(*parts, lengths, strict=True):
+            belief = sparse.csr_array((mass, (place, cell)), shape=(length * targets, cells))
             belief.eliminate_zeros()
             yield belief

@@ -242,13 +242,14 @@ class GroupForm(Form):
             for t, text in enumerate(mine[topic]):
                 part, cells = read_grid(text, task.size, _BELIEF)
                 mass, cell = cells["belief"].ravel(), places[part].ravel()
-                some = np.flatnonzero(mass)
-                rows.append(np.full(len(some), t * len(topics) + k))
-                columns.append(cell[some])
-                masses.append(mass[some])
+                rows.append(np.full(len(cell), t * len(topics) + k))
+                columns.append(cell)
+                masses.append(mass)
         entries = np.concatenate(masses), (np.concatenate(rows), np.concatenate(columns))
-        steps = len(mine[topics[0]])
-        return {"belief": sparse.csr_array(entries, shape=(steps * len(topics), task.num_cells))}
+        shape = len(mine[topics[0]]) * len(topics), task.num_cells
+        belief = sparse.csr_array(entries, shape=shape)
+        belief.eliminate_zeros()
+        return {"belief": belief}
 
 
 def _at(place: Mapping[str, float], height: float, **more: Any) -> dict[str, Any]:

@@ -195,17 +195,17 @@ class _Batch:
         # An exit on the last step allowed is an exit (terminated), not a truncation.
         truncated = self._truncated(place, at.step) & in_grid
         mode = self._sampler.mode(place)
-        columns = {"key": at.key} if self._keys.num_classes > 1 else {}
-        columns |= {} if mode is None else {"mode": mode}
-        columns |= {"misses": at.misses, "target": target, "located": located}
-        columns |= {"reward": outcome.reward}
-        columns |= {"row": at.row, "sensors": choice.count, "truncated": truncated}
-        bits = (
-            {} if choice.action is None else {"bits": np.packbits(choice.action.numpy(), axis=-1)}
-        )
-        self._taken.append(
-            {name: narrow(column.numpy()) for name, column in columns.items()} | bits
-        )
+        columns = {"misses": at.misses, "target": target, "located": located}
+        columns |= {"reward": outcome.reward, "row": at.row, "sensors": choice.count}
+        columns |= {"truncated": truncated}
+        if self._keys.num_classes > 1:
+            columns["key"] = at.key
+        if mode is not None:
+            columns["mode"] = mode
+        taken = {name: narrow(column.numpy()) for name, column in columns.items()}
+        if choice.action is not None:
+            taken["bits"] = np.packbits(choice.action.numpy(), axis=-1)
+        self._taken.append(taken)
         # `[R']`, the positions of those still running: only they are carried over, so that a step's cost falls as
         # episodes end.
         going_on = (in_grid & ~truncated).nonzero().squeeze(-1)
@@ -217,7 +217,6 @@ class _Batch:
 
     def _truncated(self, place: Tensor, step: int) -> Tensor:
         """`[R]` whether this step is the last one allowed, or the last one recorded."""
-        if self._task.max_steps is not None and step + 1 >= self._task.max_steps:
-            return torch.ones_like(place, dtype=torch.bool)
+        last = self._task.max_steps is not None and step + 1 >= self._task.max_steps
         stops = self._sampler.stops(place)
-        return torch.zeros_like(place, dtype=torch.bool) if stops is None else stops
+        return torch.full_like(place, last, dtype=torch.bool) if stops is None else stops | last
