@@ -17,11 +17,10 @@ from scipy import sparse
 from trackmdp.episodes.container import Said
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.grids import (
-    ACTIVE_SAYS,
+    ACTIVE,
     WHOLE_CELLS,
     boxed,
     boxes_of,
-    constant,
     grid_messages,
     part_text,
     read_grid,
@@ -41,7 +40,6 @@ from trackmdp.errors import UserError
 from trackmdp.world.group import Subject
 
 _BELIEF = np.dtype([("belief", "<f4")])
-_SAYS = constant(_BELIEF)
 _ABOVE, _UPRIGHT = 0.02, {"x": 0, "y": 0, "z": 0, "w": 1}
 _WHITE = {"r": 1, "g": 1, "b": 1, "a": 1}
 _FAINT = 0.4
@@ -210,8 +208,8 @@ class GroupForm(Form):
             used[0] |= rows * columns <= WHOLE_CELLS
             topics = ["/grid", *self.read_layers]
             drawn = zip(topics, beliefs.view(_BELIEF), boxes_of(used), strict=True)
-            said = {topic: boxed(stamp, _SAYS, cells, box, 0) for topic, cells, box in drawn}
-            said["/active"] = boxed(stamp, ACTIVE_SAYS, sensed[t].view(np.uint8), active, 0.01)
+            said = {topic: boxed(stamp, cells, box, 0) for topic, cells, box in drawn}
+            said["/active"] = boxed(stamp, sensed[t].view(ACTIVE), active, 0.01)
             said["/targets"] = self._scene(episode, t, first_tick + t)
             yield said | {"/part": part_text(stamp, columns / 2, rows / 2)}
 
