@@ -63,7 +63,7 @@ class Episodes(Carded, Sequence[Episode]):
     reward: Floats
     truncated: BoolArray
     sensors: npt.NDArray[np.int32]
-    bits: npt.NDArray[np.uint8] | None
+    bits: npt.NDArray[np.uint8] | None = None
     key: npt.NDArray[np.int32] | None = None
     mode: npt.NDArray[np.int32] | None = None
     start_mode: Indices | None = None
@@ -86,9 +86,7 @@ class Episodes(Carded, Sequence[Episode]):
         }
         # Lengths 2 1 3 begin at 0 2 3, and end at 6: episode i has the steps first[i] ... first[i + 1] - 1.
         first = np.concatenate([[0], np.cumsum(columns.pop("length"))])
-        return cls(
-            problem, policy, list(seeds), first=first, bits=columns.pop("bits", None), **columns
-        )
+        return cls(problem, policy, list(seeds), first=first, **columns)
 
     def __len__(self) -> int:
         return len(self.seeds)

@@ -75,9 +75,10 @@ def _note(study: Study) -> str:
     note += (
         f"; regrets may be too large where the optimum is not certified: {listed}" if wide else ""
     )
-    if study.several:
+    if any(run.settings.get("targets.count", 1) != 1 for run in study.of()):
         note += "; several targets: of all together, the best known being single optima merged"
-    return note + ("; on recordings, AIHTR of the validation tracks" if study.recorded else "")
+    tracks = any("held_out_aihtr" in run.figures for run in study.of())
+    return note + ("; on recordings, AIHTR of the validation tracks" if tracks else "")
 
 
 def shortened(study: Study) -> list[str]:
