@@ -53,8 +53,9 @@ def _write(file: Path, columns: list[str], rows: Iterable[dict[str, Any]]) -> No
         table = csv.DictWriter(stream, columns, extrasaction="ignore")
         table.writeheader()
         for row in rows:
-            table.writerow({name: _listed(value) for name, value in row.items()})
-
-
-def _listed(value: Any) -> Any:
-    return " ".join(map(str, value)) if isinstance(value, list) else value
+            listed = {
+                name: " ".join(map(str, value))
+                for name, value in row.items()
+                if isinstance(value, list)
+            }
+            table.writerow(row | listed)

@@ -220,8 +220,7 @@ class GroupForm(Form):
         for k in np.flatnonzero(episode.target[t] < self.task.num_cells).tolist():
             row, column = divmod(int(episode.target[t, k]), columns)
             place = {"x": column + 0.5, "y": rows - row - 0.5}
-            colour = dict(zip("rgb", shares_of(k), strict=True))
-            colour["a"] = 1 if episode.located[t, k] else _FAINT
+            colour = shares_of(k) | {"a": 1 if episode.located[t, k] else _FAINT}
             size = {"x": 0.6, "y": 0.6, "z": 0.01}
             disc = _at(place, _ABOVE, size=size, bottom_scale=1, top_scale=1, color=colour)
             own = {"billboard": True, "font_size": 0.4, "scale_invariant": False, "color": _WHITE}
