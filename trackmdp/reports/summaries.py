@@ -109,7 +109,8 @@ def groups_table(study: Study, threshold: float | None) -> Table:
     caption = (
         "Every world and method: means over n seeds, with intervals of the AIHTR and of the regret"
     )
-    return Table("groups", caption, [*columns, *_within_column(threshold), Column("n")], rows)
+    columns += [*_within_column(threshold), Column("n")]
+    return Table("groups", caption, columns, rows, folded="By world and method")
 
 
 def runs_table(study: Study) -> Table:
@@ -122,7 +123,8 @@ def runs_table(study: Study) -> Table:
             rows.append([world, method, run.seed, *cells, *study.ends(world), best, run.name])
     columns = [Column("world"), Column("method"), Column("seed"), *FIGURES.values(), *OPEN_ENDS]
     columns += [Column("regret per step to the best known", 5), Column("folder")]
-    return Table("runs", f"All {len(rows)} finished runs", columns, rows)
+    caption = f"All {len(rows)} finished runs"
+    return Table("runs", caption, columns, rows, folded="Every run")
 
 
 def _within_column(threshold: float | None) -> list[Column]:
