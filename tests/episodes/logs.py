@@ -58,7 +58,7 @@ def rewritten(source: Path, target: Path) -> Path:
     """The log read whole and written anew."""
     with EpisodeReader(source) as reader:
         tables = {name: reader.attachment(name) for name in TABLES}
-        writer = EpisodeWriter(target, reader.run, tables)
+        writer = EpisodeWriter(target, reader.said, tables)
         for number, facts in enumerate(reader.policies):
             plain = {key: value for key, value in facts.items() if not key.startswith("table")}
             writer.copy_policy(plain, reader.policy_tables(number))

@@ -38,7 +38,7 @@ def everything(file: Path) -> tuple[str, list[Episode]]:
         ]
         world = reader.world()
         said = [
-            reader.run.said,
+            reader.said,
             reader.end,
             reader.rows,
             reader.policies,

@@ -20,9 +20,9 @@ from trackmdp.episodes.belief_filter import beliefs
 from trackmdp.episodes.differences import first_difference
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.group_episodes import GroupEpisodes
+from trackmdp.episodes.messages import form_of
 from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
-from trackmdp.episodes.schema import LoggedRun
 from trackmdp.episodes.simulate import resimulate
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
@@ -270,33 +270,29 @@ def test_a_log_with_a_problem_file_for_each_motion_is_of_another_format(
     with monkeypatch.context() as older:
         older.setattr(schema, "LOG_FORMAT", "4")
         older.setattr(writer, "problem_bytes", lambda group: problem_bytes(group.worlds[0]))
-        file = write(tmp_path / "a.mcap", played(1))
+        file = write(tmp_path / "a.mcap", [])
     for read in (EpisodeReader, recover):
         with pytest.raises(UserError, match=r"^file=.*a.mcap: format 4 \(.*\), expected format 5$"):
             read(file)
     assert [each.name for each in tmp_path.iterdir()] == ["a.mcap"]
 
 
-@pytest.mark.parametrize("said", ["x", "0 " * 1001])
-def test_targets_that_are_none_or_too_many_are_damage(said: str, log: Path) -> None:
-    with EpisodeReader(log) as reader:
-        facts = reader.run.said | {"targets": said}
-    assert LoggedRun(Path("a.mcap"), facts | {"targets": "0 " * 1000}).kinds == (0,) * 1000
-    with pytest.raises(UserError, match="not a log of trackmdp"):
-        LoggedRun(Path("a.mcap"), facts)
-
-
-@pytest.mark.parametrize("kinds", [(1, 0), (0, 2, 0), (-1,), (0, 0, 3, 1), ()])
-def test_targets_of_motions_that_are_not_there_are_damage(kinds: tuple[int], log: Path) -> None:
-    with EpisodeReader(log) as reader:
-        reader.run.kinds = kinds
-        with pytest.raises(UserError, match="problem"):
-            reader.world()
+@pytest.mark.parametrize("said", ["x", "0 " * 1001, "1 0", "0 2 0", "-1", "0 0 3 1", ""])
+def test_metadata_of_other_targets_than_the_problem_are_damage(
+    said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = schema.shape_of(GROUP) | {"targets": said}
+    with monkeypatch.context() as forged:
+        forged.setattr(schema, "shape_of", lambda problem: other)
+        file = write(tmp_path / "a.mcap", played(1))
+    for read in (EpisodeReader, recover):
+        with pytest.raises(UserError, match=r"metadata trackmdp.run of another problem"):
+            read(file)
 
 
 def test_steps_of_other_targets_are_damage(log: Path) -> None:
     with EpisodeReader(log) as reader:
-        reader.run.kinds = (0, 1)
+        reader.form = form_of(Group(GROUP.worlds[:2]))
         reader.file = Path("a.mcap")
         with pytest.raises(UserError, match=r"file=a.mcap: not a whole log"):
             reader.read(0)

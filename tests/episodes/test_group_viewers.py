@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.episodes.test_group_log import played
+from tests.episodes.test_group_log import GROUP, played
 from tests.episodes.test_group_log import write as write_several
 from trackmdp.episodes.layouts import layout
-from trackmdp.episodes.schema import schemas_of_several
+from trackmdp.episodes.schema import schemas_of
 
 pytest.importorskip("foxglove", reason="needs the package foxglove-sdk")
 pytest.importorskip("google.protobuf", reason="needs the package protobuf")
@@ -21,7 +21,7 @@ from foxglove.messages import SceneUpdate
 
 from tests.episodes.test_viewers import PANELS, check, check_json, drawn, messages, parsed
 
-SEVERAL = schemas_of_several(3)
+SEVERAL = schemas_of(GROUP)
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.writer import Writer
 
-from tests.episodes.logs import recorded, write
+from tests.episodes.logs import WORLD, recorded, write
 from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged
 from trackmdp.episodes.reader import EpisodeReader, verify
@@ -74,13 +74,13 @@ def _written(stream: Any, parts: Parts) -> None:
         topic: writer.register_channel(
             topic, "json", writer.register_schema(name, "jsonschema", b"{}")
         )
-        for topic, (name, _) in schema.SCHEMAS.items()
+        for topic, (name, _) in schema.schemas_of(WORLD).items()
     }
     for name in (RUN, POLICY):
         writer.add_metadata(name, schema.seal(name, parts["m"][name]))
     for name, content in parts["a"].items():
         writer.add_attachment(0, 0, name, "x", content)
-    order = {topic: place for place, topic in enumerate(schema.SCHEMAS)}
+    order = {topic: place for place, topic in enumerate(schema.schemas_of(WORLD))}
     every = [
         (time, order[topic], topic, data)
         for topic, each in parts["x"].items()

@@ -110,7 +110,7 @@ def test_what_the_log_carries_simulates_again(log: Path) -> None:
         )
         assert (reader.policy(0).dense() == policy().dense()).all()
         assert reader.attachment("config.yaml").decode() == CONFIG
-        assert schema.versions().items() <= reader.run.said.items()
+        assert schema.versions().items() <= reader.said.items()
         verified = verify(reader)
         assert (verified.episodes, verified.difference) == (30, None)
         assert verified.steps == sum(map(len, recorded(30)))
@@ -171,7 +171,7 @@ def test_grid_messages_keep_to_the_rules_of_viewers(log: Path) -> None:
     assert len(data) == 4 * said["row_stride"]
     lowest = np.frombuffer(data[:4], "<f4")[0]  # belief of the first cell of the last of our rows
     assert lowest == recorded(1)[0].belief[0, 12]
-    assert "null" not in json.dumps(list(schema.SCHEMAS.values()))
+    assert "null" not in json.dumps(list(schema.schemas_of(WORLD).values()))
 
 
 def test_a_log_of_a_rectangle_comes_back(tmp_path: Path) -> None:
@@ -179,7 +179,7 @@ def test_a_log_of_a_rectangle_comes_back(tmp_path: Path) -> None:
     world = World(kernel, (3, 5), cost=0.2, t_max=1)
     episodes = recorded(6, world=world)
     with EpisodeReader(write(tmp_path / "a.mcap", episodes, world=world)) as reader:
-        assert (reader.world().size, reader.run.said["size"], reader.run.said["columns"]) == (
+        assert (reader.world().size, reader.said["size"], reader.said["columns"]) == (
             (3, 5),
             "3",
             "5",

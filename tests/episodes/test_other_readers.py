@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from tests.episodes.logs import recorded, write
-from trackmdp.episodes.schema import SCHEMAS
+from tests.episodes.logs import WORLD, recorded, write
+from trackmdp.episodes.schema import schemas_of
 
 NODE = shutil.which("node")
 READ = """
@@ -77,7 +77,7 @@ def test_mcap_core_reads_the_whole_file(log: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     said, episodes = json.loads(done.stdout), recorded(30)
     steps = sum(map(len, episodes))
-    assert said["counts"] == {**dict.fromkeys(SCHEMAS, steps), "/episode": 30}
+    assert said["counts"] == {**dict.fromkeys(schemas_of(WORLD), steps), "/episode": 30}
     assert said["attachments"] == [
         "config.yaml",
         "problem.npz",
@@ -98,5 +98,5 @@ def test_the_mcap_package_reads_the_whole_file(log: Path) -> None:
             assert message.publish_time == message.log_time
         summary = reader.get_summary()
     steps = sum(map(len, recorded(30)))
-    assert counts == {**dict.fromkeys(SCHEMAS, steps), "/episode": 30}
+    assert counts == {**dict.fromkeys(schemas_of(WORLD), steps), "/episode": 30}
     assert summary and {schema.name for schema in summary.schemas.values()} >= {"foxglove.Grid"}

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from tests.episodes.logs import policy, recorded, write
+from tests.episodes.logs import WORLD, policy, recorded, write
 from tests.helpers import limited
 from trackmdp.episodes import grids
 from trackmdp.episodes.differences import first_difference
 from trackmdp.episodes.grids import WHOLE_CELLS
 from trackmdp.episodes.layouts import layout
 from trackmdp.episodes.reader import EpisodeReader
-from trackmdp.episodes.schema import SCHEMAS
+from trackmdp.episodes.schema import schemas_of
 from trackmdp.episodes.simulate import simulate
 from trackmdp.motion.kernels import random_walk
 from trackmdp.policies.policy import Policy
@@ -146,7 +146,7 @@ def test_the_messages_of_a_large_grid_are_as_large_as_what_is_known() -> None:
     """300 x 300 cells of 8 bytes would be 960,000 characters; a target that moves by one cell is within 5 x 5."""
     world = make_world("random_walk", size=300, cost=0.2, t_max=1, safe_cost=10.0)
     [episode] = simulate(limited(world, 6), Policy.none(world), 1, seed=0).complete()
-    for layers in grids.grid_messages(episode, world.size, 0):
+    for layers in grids.grid_messages(episode, world.size, 0, episode.action):
         assert len(layers["/grid"]) < 1000
         assert max(len(text) for text in layers.values()) < 1000
 
@@ -159,7 +159,9 @@ def test_the_part_that_viewers_look_at_moves_by_nine_rows_within_the_grid() -> N
     target = np.array([0, 30, 35, 36, 59, 60]) * 10  # the last has exited
     parts = [
         json.loads(layers["/part"])["translation"]
-        for layers in grids.grid_messages(replace(episode, target=target), world.size, 0)
+        for layers in grids.grid_messages(
+            replace(episode, target=target), world.size, 0, episode.action
+        )
     ]
     assert [part["y"] for part in parts] == [60 - 12.5, 60 - 31.5, 60 - 31.5, 60 - 40.5, 12.5, 12.5]
     assert {(part["x"], part["z"]) for part in parts} == {(5, 0)}
@@ -170,7 +172,10 @@ def test_the_part_that_viewers_look_at_moves_by_nine_rows_within_the_grid() -> N
 )
 def test_a_grid_that_lies_outside_is_damage(place: dict[str, Any]) -> None:
     [episode] = recorded(1, acting=policy(WALK), world=WALK)
-    every = [json.loads(layers["/grid"]) for layers in grids.grid_messages(episode, WALK.size, 0)]
+    every = [
+        json.loads(layers["/grid"])
+        for layers in grids.grid_messages(episode, WALK.size, 0, episode.action)
+    ]
     every[0]["pose"]["position"] |= place
     # a single column fits into an empty slice as well
     every[1] |= {"column_count": 1, "data": b64encode(bytes(24)).decode(), "pose": every[0]["pose"]}
@@ -179,12 +184,12 @@ def test_a_grid_that_lies_outside_is_damage(place: dict[str, Any]) -> None:
             grids.read_grids([json.dumps(wrong).encode()], WALK.size)
 
 
-@pytest.mark.parametrize("topic", SCHEMAS)
+@pytest.mark.parametrize("topic", schemas_of(WORLD))
 def test_every_message_is_what_its_schema_says(log: Path, topic: str) -> None:
     found = messages(log, topic)
     assert found
     for said in found:
-        check_json(said, SCHEMAS[topic][1], topic)
+        check_json(said, schemas_of(WORLD)[topic][1], topic)
 
 
 def check_json(value: Any, schema: dict[str, Any], place: str) -> None:

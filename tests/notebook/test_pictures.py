@@ -147,7 +147,7 @@ def test_several_targets_are_a_video_in_colours_of_their_own(tmp_path: Any) -> N
     with image.open(episodes.video(tmp_path / "a.gif", 1)) as shown:
         assert shown.n_frames == len(episodes[1])
         pixels = {colour for _, colour in shown.convert("RGB").getcolors(2**20)}
-    wanted = [tuple(round(255 * share) for share in shares_of(k)) for k in range(3)]
+    wanted = [tuple(round(255 * share) for share in shares_of(k).values()) for k in range(3)]
     near = [min(max(abs(a - b) for a, b in zip(c, w, strict=True)) for c in pixels) for w in wanted]
     assert max(near) < 80  # a .gif has few colours; grey and white are farther from all of them
 

@@ -11,20 +11,20 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from tensordict import TensorDict
+from torch import Tensor
 
-from trackmdp.arrays.types import AnyArray, Array, BoolArray, Indices
+from trackmdp.arrays.types import BoolArray, Indices
 from trackmdp.durable import write_text
 from trackmdp.episodes.belief_filter import beliefs
-from trackmdp.episodes.episode import Episode, Floats, last_cells
+from trackmdp.episodes.episode import Episode, Floats
 from trackmdp.episodes.episode_draws import Columns
 from trackmdp.episodes.grids import check_layers
-from trackmdp.episodes.simulated_figures import Simulation, simulation
+from trackmdp.episodes.simulated_figures import Simulation, mean_ratio
 from trackmdp.errors import UserError, output_of
 from trackmdp.notebook.card import Card, Carded, decimal, grid_words, percent
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers.several.merging import Rule
-from trackmdp.world.group import Group
-from trackmdp.world.problem import Problem
+from trackmdp.world.group import Subject
 
 _BELIEF = 25_600  # cells, or hidden states, of the beliefs updated together: memory stays bounded on large grids
 
@@ -63,7 +63,7 @@ class Episodes(Carded, Sequence[Episode]):
     reward: Floats
     truncated: BoolArray
     sensors: npt.NDArray[np.int32]
-    bits: npt.NDArray[np.uint8] | None
+    bits: npt.NDArray[np.uint8] | None = None
     key: npt.NDArray[np.int32] | None = None
     mode: npt.NDArray[np.int32] | None = None
     start_mode: Indices | None = None
@@ -71,7 +71,7 @@ class Episodes(Carded, Sequence[Episode]):
     @classmethod
     def of(
         cls,
-        problem: Problem | Group,
+        problem: Subject,
         policy: Policy | Rule | None,
         seeds: Sequence[int],
         batches: Sequence[Columns],
@@ -86,9 +86,7 @@ class Episodes(Carded, Sequence[Episode]):
         }
         # Lengths 2 1 3 begin at 0 2 3, and end at 6: episode i has the steps first[i] ... first[i + 1] - 1.
         first = np.concatenate([[0], np.cumsum(columns.pop("length"))])
-        return cls(
-            problem, policy, list(seeds), first=first, bits=columns.pop("bits", None), **columns
-        )
+        return cls(problem, policy, list(seeds), first=first, **columns)
 
     def __len__(self) -> int:
         return len(self.seeds)
@@ -127,65 +125,67 @@ class Episodes(Carded, Sequence[Episode]):
         return Card(f"{title} (figures: mean ± standard error)", facts)
 
     def _episode(self, number: int) -> Episode:
-        steps = slice(int(self.first[number]), int(self.first[number + 1]))
-        target, located = self.target[steps].astype(np.int64), self.located[steps]
-        misses, start = self.misses[steps].astype(np.int64), self.start[number]
+        steps, start = self._steps(number), self.start[number]
         truncated = bool(self.truncated[steps][-1])
-        return Episode(
+        made = Episode(
             number=number,
             seed=self.seeds[number],
             policy=0,
             start=start if start.ndim else int(start),
-            misses=misses,
-            action=self._action(steps, start, misses, target, located),
-            target=target,
-            located=located,
+            misses=self.misses[steps].astype(np.int64),
+            action=np.zeros((0, 0), bool),
+            target=self.target[steps].astype(np.int64),
+            located=self.located[steps],
             reward=self.reward[steps],
             terminated=not truncated,
             truncated=truncated,
             mode=None if self.mode is None else self.mode[steps].astype(np.int64),
             start_mode=0 if self.start_mode is None else int(self.start_mode[number]),
         )
+        return replace(made, action=self._action(made))
 
-    def _keys(self, steps: slice, last_cell: Indices) -> Indices:
-        """`[T]`, the policy's key before each step."""
-        return last_cell if self.key is None else self.key[steps].astype(np.int64)
+    def _steps(self, number: int) -> slice:
+        return slice(int(self.first[number]), int(self.first[number + 1]))
 
-    def _action(
-        self, steps: slice, start: Any, misses: Indices, target: Indices, located: BoolArray
-    ) -> BoolArray:
+    def _state(self, episode: Episode) -> tuple[Tensor, Tensor]:
+        """`[T]` each, the policy's key and n before each step."""
+        key = episode.last_cell
+        if self.key is not None:
+            key = self.key[self._steps(episode.number)].astype(np.int64)
+        return torch.from_numpy(key), torch.from_numpy(episode.misses)
+
+    def _action(self, episode: Episode) -> BoolArray:
         """`[T, S]`."""
         # A policy with a table needs no bits: its action follows from (key, misses), and S rows of M bits are not
         # kept.
         if self.bits is not None:
             count = self.problem.task.total_sensors
-            return np.unpackbits(self.bits[steps], axis=-1, count=count).astype(np.bool_)
-        key = self._keys(steps, last_cells(start, target, located)[:-1])
-        found: BoolArray = self.policy.act(torch.from_numpy(key), torch.from_numpy(misses)).numpy()
+            bits = self.bits[self._steps(episode.number)]
+            return np.unpackbits(bits, axis=-1, count=count).astype(np.bool_)
+        found: BoolArray = self.policy.act(*self._state(episode)).numpy()
         return found
 
     def figures(self) -> Simulation:
         """The policy's figures from the episodes, with standard errors."""
-        if not len(self):
-            return simulation(np.zeros((6, 0)))
         in_grid = self.target < self.problem.num_cells
         forced = (self.misses > self.problem.t_max) & in_grid
         # Sensors are counted where they cost: not at the exit, nor where the safe action replaced them.
         chosen = self.sensors * (in_grid & ~forced)
-        every = np.ones(len(self.target))
-        columns: list[AnyArray] = [
-            self.reward,
-            in_grid,
-            self.located,
-            chosen,
-            forced,
-            every,
-        ]
+        steps = np.ones(len(self.target))
+        columns = (self.reward, in_grid, self.located, chosen, forced, steps)
         # Every episode has a step, so that no two of `first` are the same and each sum belongs to one episode.
-        totals: Array = np.stack(
-            [np.add.reduceat(column.astype(np.float64), self.first[:-1]) for column in columns]
+        reward, inside, detections, sensors, safe, length = (
+            np.add.reduceat(column.astype(np.float64), self.first[:-1]) for column in columns
         )
-        return simulation(totals)
+        every = np.ones(len(self))
+        return Simulation(
+            episodes=len(self),
+            aihtr=mean_ratio(reward, every),
+            accuracy=mean_ratio(detections, inside),
+            sensors_per_step=mean_ratio(sensors, inside),
+            safe_per_episode=mean_ratio(safe, every),
+            expected_length=mean_ratio(length, every),
+        )
 
     @property
     def _at_once(self) -> int:
@@ -208,10 +208,7 @@ class Episodes(Carded, Sequence[Episode]):
     def _probability(self, episode: Episode) -> Floats:
         if self.policy is None:
             return self.problem.covered(episode.action).astype(np.float32)
-        steps = slice(int(self.first[episode.number]), int(self.first[episode.number + 1]))
-        key = self._keys(steps, episode.last_cell)
-        state = torch.from_numpy(key), torch.from_numpy(episode.misses)
-        found: Floats = self.policy.seeing(*state).float().numpy()
+        found: Floats = self.policy.seeing(*self._state(episode)).float().numpy()
         return found
 
     def complete(self) -> Iterator[Episode]:

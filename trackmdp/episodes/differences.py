@@ -20,11 +20,11 @@ def first_difference(
         again: the other.
         belief_tolerance: differences of the belief up to this one pass.
     """
-    pairs = enumerate(zip(logged.singles(), again.singles(), strict=True))
-    found = {k: _first(mine, other, belief_tolerance) for k, (mine, other) in pairs}
-    several = len(found) > 1
-    said = (f"target {k}, {each}" if several else each for k, each in found.items() if each)
-    return next(said, None)
+    pairs = zip(logged.singles(), again.singles(), strict=True)
+    for k, (mine, other) in enumerate(pairs):
+        if found := _first(mine, other, belief_tolerance):
+            return f"target {k}, {found}" if logged.several else found
+    return None
 
 
 def _first(logged: Episode, again: Episode, belief_tolerance: float) -> str | None:
@@ -35,10 +35,9 @@ def _first(logged: Episode, again: Episode, belief_tolerance: float) -> str | No
             return f"{name}: logged {mine}, re-simulated {other}"
     steps = min(len(logged), len(again))
     known = [name for name in PER_STEP if name != "mode" or logged.mode is not None]
-    found = [_differing(logged, again, name, steps, belief_tolerance) for name in known]
-    if apart := list(filter(None, found)):
-        step, how = min(apart, key=lambda each: each[0])
-        return f"step {step}, {how}"
+    found = (_differing(logged, again, name, steps, belief_tolerance) for name in known)
+    if first := min(filter(None, found), key=lambda each: each[0], default=None):
+        return f"step {first[0]}, {first[1]}"
     if len(logged) != len(again):
         return f"length: logged {len(logged)} steps, re-simulated {len(again)}"
     return None

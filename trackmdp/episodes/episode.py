@@ -120,7 +120,16 @@ class Episode(Carded):
         As in a rollout the true cell is not among them; it is `target`. With a window actions are in its local numbers,
         as the environment takes them. With `max_steps` there is a `step_count`.
         """
-        return _transitions(self, task)
+        states, action = (_of_several if self.several else _of_one)(self, task)
+        if task.max_steps:
+            states["step_count"] = np.arange(len(self) + 1)
+        # Of the T + 1 states the last has no action, and the first is no outcome.
+        current = {key: value[:-1] for key, value in states.items()}
+        following = {key: value[1:] for key, value in states.items()}
+        following["reward"] = self.reward[:, None]
+        current |= _ends(len(self), False, False)
+        following |= _ends(len(self), self.terminated, self.truncated)
+        return TensorDict({**current, "action": action, "next": following}, [len(self)])
 
     def card(self) -> Card:
         """Length, return, detections and end."""
@@ -134,21 +143,6 @@ class Episode(Carded):
         facts["located"] = f"{count:,} times" if self.several else f"in {count:,} steps"
         facts["sensors per step"] = decimal(float(self.action.sum(1).mean()))
         return Card(f"Episode: number {self.number}, seed {self.seed}", facts)
-
-
-def _transitions(episode: Episode, task: Task) -> TensorDict:
-    """See `Episode.to_tensordict`."""
-    steps = len(episode)
-    states, action = (_of_several if episode.several else _of_one)(episode, task)
-    if task.max_steps:
-        states["step_count"] = np.arange(steps + 1)
-    # Of the T + 1 states the last has no action, and the first is no outcome.
-    current = {key: value[:-1] for key, value in states.items()}
-    following = {key: value[1:] for key, value in states.items()}
-    following["reward"] = episode.reward[:, None]
-    current |= _ends(steps, False, False)
-    following |= _ends(steps, episode.terminated, episode.truncated)
-    return TensorDict({**current, "action": action, "next": following}, [steps])
 
 
 def _of_one(episode: Episode, task: Task) -> tuple[dict[str, AnyArray], BoolArray]:
@@ -238,11 +232,5 @@ def last_cells(start: Any, target: Indices, located: BoolArray) -> Indices:
 
 def _ends(steps: int, terminated: bool, truncated: bool) -> dict[str, Any]:
     """The flags `done`, `terminated` and `truncated` `[T, 1]` of an episode of T steps."""
-    flags = {name: np.zeros((steps, 1), dtype=bool) for name in ("done", "terminated", "truncated")}
-    for name, value in (
-        ("terminated", terminated),
-        ("truncated", truncated),
-        ("done", terminated or truncated),
-    ):
-        flags[name][-1] = value
-    return flags
+    last, over = np.arange(steps)[:, None] == steps - 1, terminated or truncated
+    return {"done": last & over, "terminated": last & terminated, "truncated": last & truncated}

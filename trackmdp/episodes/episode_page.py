@@ -13,8 +13,7 @@ from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.target_colours import COLOURS
 from trackmdp.sensing.task import Task
 from trackmdp.solvers import bounds
-from trackmdp.world.group import Group
-from trackmdp.world.problem import Problem
+from trackmdp.world.group import Subject
 
 MOST_STEPS = 2000
 """Steps on a page, or frames of a video; a longer episode is cut there, with a note on the page."""
@@ -26,7 +25,7 @@ _MOST_CELLS = 100
 """Shaded cells of a step, the likeliest."""
 
 
-def page(problem: Problem | Group, episode: Episode, label: str = "", seed: str = "") -> str:
+def page(problem: Subject, episode: Episode, label: str = "", seed: str = "") -> str:
     """The page as text.
 
     Args:
@@ -44,7 +43,7 @@ def page(problem: Problem | Group, episode: Episode, label: str = "", seed: str 
     return template.replace("@TITLE@", title).replace("@DATA@", text.replace("<", "\\u003c"))
 
 
-def _about(problem: Problem | Group, episode: Episode, seed: str) -> str:
+def _about(problem: Subject, episode: Episode, seed: str) -> str:
     """The line under the title."""
     rows, columns = problem.task.size
     about = [f"{rows} x {columns} grid, {len(episode)} steps"]
@@ -60,11 +59,11 @@ def _about(problem: Problem | Group, episode: Episode, seed: str) -> str:
     return "; ".join(about)
 
 
-def _content(problem: Problem | Group, episode: Episode) -> dict[str, Any]:
+def _content(problem: Subject, episode: Episode) -> dict[str, Any]:
     """The data of the page: of one target all at once, of several a part for each under `targets`."""
     shown, task = slice(0, MOST_STEPS), problem.task
     targets = [_of_target(single, task) for single in episode.singles()]
-    own = {"targets": targets, "colours": COLOURS} if isinstance(problem, Group) else targets[0]
+    own = {"targets": targets, "colours": COLOURS} if problem.targets else targets[0]
     return (
         own
         | _of_world(problem, episode)
@@ -82,9 +81,9 @@ def _content(problem: Problem | Group, episode: Episode) -> dict[str, Any]:
     )
 
 
-def _of_world(problem: Problem | Group, episode: Episode) -> dict[str, Any]:
+def _of_world(problem: Subject, episode: Episode) -> dict[str, Any]:
     """The clocked bound of the start cell, None without a motion model or of several targets; modes where there are."""
-    world = None if isinstance(problem, Group) else problem.model
+    world = problem.model
     if world is None:
         return {"bound": None}
     found: dict[str, Any] = {"bound": float(bounds.clocked(world)[episode.start])}

@@ -10,8 +10,8 @@ from typing import Any
 
 from trackmdp.durable import write_text
 from trackmdp.episodes.episode_page import page
-from trackmdp.episodes.group_messages import form_of
 from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.schema import schemas_of
 
 
 def write_page(reader: EpisodeReader, file: Path, number: int | None = None) -> None:
@@ -24,7 +24,7 @@ def write_page(reader: EpisodeReader, file: Path, number: int | None = None) -> 
     wanted = reader.rows[0]["episode"] if number is None else number
     episode = reader.read(wanted)
     label = reader.policies[episode.policy].get("label", "")
-    write_text(file, page(reader.world(), episode, label, str(reader.run.said.get("seed", ""))))
+    write_text(file, page(reader.world(), episode, label, str(reader.said.get("seed", ""))))
 
 
 _LEFT_OUT = {"target_x", "target_y", "first", "last"}
@@ -39,7 +39,8 @@ def write_tables(reader: EpisodeReader, folder: Path, number: int | None = None)
     """
     rows = [reader.row(number)] if number is not None else reader.rows
     folder.mkdir(parents=True, exist_ok=True)
-    form, fields = form_of(reader.run), reader.run.schemas["/step"][1]["properties"]
+    form = reader.form
+    fields = schemas_of(form.problem)["/step"][1]["properties"]
     steps = (
         json.loads(message) for row in rows for message in form.steps(reader.read(row["episode"]))
     )
@@ -52,8 +53,9 @@ def _write(file: Path, columns: list[str], rows: Iterable[dict[str, Any]]) -> No
         table = csv.DictWriter(stream, columns, extrasaction="ignore")
         table.writeheader()
         for row in rows:
-            table.writerow({name: _listed(value) for name, value in row.items()})
-
-
-def _listed(value: Any) -> Any:
-    return " ".join(map(str, value)) if isinstance(value, list) else value
+            listed = {
+                name: " ".join(map(str, value))
+                for name, value in row.items()
+                if isinstance(value, list)
+            }
+            table.writerow(row | listed)

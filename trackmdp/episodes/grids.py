@@ -9,6 +9,7 @@ import base64
 import json
 import math
 from collections.abc import Iterator, Sequence
+from functools import cache
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -38,7 +39,8 @@ ACTIVE, _TARGET = np.dtype([("active", "u1")]), np.dtype([("target", "u1")])
 _TYPES = {np.dtype("<f4"): 7, np.dtype("u1"): 1}  # foxglove.NumericType
 
 
-def constant(cell: np.dtype[Any], side: float = 1) -> bytes:
+@cache
+def _constant(cell: np.dtype[Any], side: float) -> bytes:
     """The constant fields of all messages of a layer of square cells, without the braces."""
     fields = (cell.fields or {}).items()
     said = {
@@ -53,20 +55,16 @@ def constant(cell: np.dtype[Any], side: float = 1) -> bytes:
     return json_bytes(said)[1:-1]
 
 
-_GRID_SAYS = constant(_CELL)
-_ACTIVE_SAYS = constant(ACTIVE)
-_TARGET_SAYS = constant(_TARGET, side=0.5)
-
-_DOT = np.array([[[1]], [[0]]], np.uint8)
+_DOT = np.array([[[1]], [[0]]], np.uint8).view(_TARGET)
 """The target's layer, a single cell; 0 once it has exited."""
 
 
 def grid_messages(
-    episode: Episode, size: tuple[int, int], first_tick: int, covered: BoolArray | None = None
+    episode: Episode, size: tuple[int, int], first_tick: int, covered: BoolArray
 ) -> Iterator[dict[str, bytes]]:
     """Of each step topic -> message, a layer above the other in this order, and where viewers look.
 
-    `covered` `[T, M]` are the cells that the sensors on see; None where each sees its own.
+    `covered` `[T, M]` are the cells that the sensors on see.
     """
     rows, columns = size
     exited = (episode.target == rows * columns).astype(int).tolist()
@@ -75,32 +73,31 @@ def grid_messages(
     for t, (cells, box, active, around) in enumerate(layers):
         stamp, (row, column), (y, x) = stamp_of(first_tick + t), at[t], parts[t]
         yield {
-            "/grid": boxed(stamp, _GRID_SAYS, cells, box, 0),
-            "/active": boxed(stamp, _ACTIVE_SAYS, active, around, 0.01),
+            "/grid": boxed(stamp, cells, box, 0),
+            "/active": boxed(stamp, active, around, 0.01),
             # half as wide as its cell, so that the layers beneath it show: in column 3 from x = 3.25 to 3.75
             "/target": grid_text(
-                stamp, _TARGET_SAYS, _DOT[exited[t]], column + 0.25, rows - row - 0.75, 0.02
+                stamp, _DOT[exited[t]], column + 0.25, rows - row - 0.75, 0.02, 0.5
             ),
             "/part": part_text(stamp, x, rows - y),
         }
 
 
 def _layers(
-    episode: Episode, size: tuple[int, int], covered: BoolArray | None
+    episode: Episode, size: tuple[int, int], covered: BoolArray
 ) -> Iterator[tuple[AnyArray, Box, AnyArray, Box]]:
     """Of each step belief and policy `[R, C]`, and the cells sensed, each with the box to be written."""
     # A few steps at a time: of all steps together they would take 12 bytes for each step and cell.
     each = max(1, _AT_ONCE // math.prod(size))
-    active = episode.action if covered is None else covered
     for begin in range(0, len(episode), each):
         some = slice(begin, begin + each)
-        sensed = active[some].reshape(-1, *size)
+        sensed = covered[some].reshape(-1, *size)
         cells = np.zeros(sensed.shape, _CELL)
         cells["belief"] = episode.belief[some].reshape(cells.shape)
         cells["policy"] = episode.probability[some].reshape(cells.shape)
         used = (cells["belief"] > 0) | (cells["policy"] > 0) | (math.prod(size) <= WHOLE_CELLS)
-        active_cells = sensed.view(np.uint8)
-        yield from zip(cells, boxes_of(used), active_cells, boxes_of(sensed), strict=True)
+        active = sensed.view(ACTIVE)
+        yield from zip(cells, boxes_of(used), active, boxes_of(sensed), strict=True)
 
 
 def stamp_of(tick: int) -> bytes:
@@ -144,21 +141,23 @@ def boxes_of(used: BoolArray) -> Iterator[Box]:
     return zip(*(each.tolist() for each in ends), strict=True)
 
 
-def boxed(stamp: bytes, says: bytes, cells: AnyArray, box: Box, z: float) -> bytes:
+def boxed(stamp: bytes, cells: AnyArray, box: Box, z: float) -> bytes:
     """The message of the part `box` of a layer `[R, C]`."""
     top, bottom, left, right = box
-    return grid_text(stamp, says, cells[top:bottom, left:right], left, len(cells) - bottom, z)
+    return grid_text(stamp, cells[top:bottom, left:right], left, len(cells) - bottom, z)
 
 
-def grid_text(stamp: bytes, says: bytes, cells: AnyArray, x: float, y: float, z: float) -> bytes:
-    """The message of `cells` `[R, C]` with the lowest left corner at (x, y, z)."""
+def grid_text(
+    stamp: bytes, cells: AnyArray, x: float, y: float, z: float, side: float = 1
+) -> bytes:
+    """The message of `cells` `[R, C]` of this side with the lowest left corner at (x, y, z)."""
     columns, stride = cells.shape[1], cells.dtype.itemsize
     # turned upside down, since a viewer's first row is the lowest
     data = base64.b64encode(cells[::-1].tobytes())
     return (
         b'%s,"pose":{"position":{"x":%g,"y":%g,"z":%g},"orientation":{"x":0,"y":0,"z":0,"w":1}},'
         b'"column_count":%d,"row_stride":%d,%s,"data":"%s"}'
-    ) % (stamp, x, y, z, columns, columns * stride, says, data)
+    ) % (stamp, x, y, z, columns, columns * stride, _constant(cells.dtype, side), data)
 
 
 def read_grids(grids: Sequence[bytes], size: tuple[int, int]) -> tuple[Floats, Floats]:

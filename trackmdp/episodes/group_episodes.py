@@ -1,23 +1,30 @@
-"""Simulated episodes of several targets; see `Episodes`."""
+"""Simulated episodes of several targets, each from its own generators; see `Episodes` and `simulate`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import torch
+from scipy import sparse
 
-from trackmdp.arrays.types import Array
+from trackmdp.arrays.types import Array, IndexArray
+from trackmdp.environment.group_paths import GroupPaths, Walks
 from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.episode import Episode
-from trackmdp.episodes.group_simulate import AT_ONCE, group_beliefs
+from trackmdp.episodes.episode_draws import Columns, Draws, joined, narrow, uniform
 from trackmdp.notebook.card import Card, grid_words
+from trackmdp.sensing.outcomes import Costs
 from trackmdp.solvers.several.group_figures import GroupEvaluation, with_ends
 from trackmdp.solvers.several.group_value import known_mean, known_rewards
 from trackmdp.solvers.several.merging import Rule
+from trackmdp.solvers.several.simulation import GroupStep, group_steps
 from trackmdp.world.group import Group
 
+_AT_ONCE = 4096
+"""Targets of the episodes that are stepped together; 256 steps of their draws are held, 8 MB."""
 _BELIEFS = 2**22
 """Numbers of the beliefs that are kept together, at most, if a target may be in 30 cells in each of 100 steps."""
 
@@ -72,10 +79,90 @@ class GroupEpisodes(Episodes):
 
     @property
     def _at_once(self) -> int:
-        return max(1, min(AT_ONCE, _BELIEFS // 3000) // len(self.problem))
+        return max(1, min(_AT_ONCE, _BELIEFS // 3000) // len(self.problem))
 
     def _completed(self, begin: int, end: int) -> Iterator[Episode]:
         """Simulated once more."""
-        found = group_beliefs(self.policy, self.seeds[begin:end])
+        some = batches(self.policy, self.seeds[begin:end])
+        found = (belief for each in some for belief in each.beliefs())
         for episode, belief in zip(self[begin:end], found, strict=True):
             yield replace(episode, belief=belief)
+
+
+def batches(rule: Rule, seeds: Sequence[int]) -> Iterator[_Batch]:
+    """One episode for each of `seeds`, each independent of the others."""
+    each, paths = max(1, _AT_ONCE // len(rule.group)), GroupPaths(rule.group, held_out=True)
+    for begin in range(0, len(seeds), each):
+        yield _Batch(rule, paths, seeds[begin : begin + each])
+
+
+class _Batch:
+    """E episodes stepped together until the last one has ended."""
+
+    def __init__(self, rule: Rule, paths: GroupPaths, seeds: Sequence[int]) -> None:
+        self._rule, self._task, self._costs = rule, rule.task, Costs(rule.task)
+        self._shape = len(seeds), len(rule.group)
+        # As with one target, moves and reports apart, so that two policies with one seed meet the same targets.
+        draw, targets = paths.sampler.draw, self._shape[1]
+        moves = Draws(seeds, lambda count, rng: draw(count * targets, rng).view(count, targets))
+        place = torch.stack([paths.begin(rng) for rng in moves.generators])
+        self._walks = Walks(paths, place, moves.at)
+        self._seen = uniform(seeds, "report", targets)
+
+    @torch.no_grad()
+    def _steps(self) -> Iterator[GroupStep]:
+        return group_steps(self._rule, self._walks, self._reports)
+
+    def _reports(self, row: IndexArray, step: int) -> Array:
+        """`[E, K]` draws of the reports."""
+        draws = np.ones(self._shape)
+        draws[row] = self._seen.at(torch.from_numpy(row), step).numpy()
+        return draws
+
+    def run(self) -> Columns:
+        """Columns of `GroupEpisodes`, stepped until the last target has left, or until the last step allowed."""
+        walks, cells = self._walks, self._task.num_cells
+        start = np.where(walks.inside, walks.state % cells, cells).astype(np.int64)
+        columns, length = joined([self._taken(step) for step in self._steps()])
+        return columns | {"start": start, "length": length}
+
+    def _taken(self, step: GroupStep) -> Columns:
+        """The columns of a step."""
+        task, some = self._task, np.any(step.present, axis=1)
+        action = np.zeros((self._shape[0], task.num_cells), dtype=bool)
+        action.ravel()[step.on] = True
+        spent = self._costs.price_of(torch.from_numpy(action))
+        spent = torch.where(torch.from_numpy(step.late), task.safe_cost, spent)
+        earned = task.reward * torch.from_numpy(step.seen).sum(-1)
+        columns: Columns = {
+            "misses": step.before.misses,
+            "sensors": action.sum(axis=1),
+            "bits": np.packbits(action, axis=1),
+            "reward": (earned - spent * torch.from_numpy(some)).float().numpy(),
+            "target": np.where(step.inside, step.cell, task.num_cells),
+            "located": step.seen | step.entered,
+            # In an episode's last step, whether a target was in the grid, which no exit ended then.
+            "truncated": some,
+            "row": np.arange(len(action)),
+        }
+        return {name: narrow(column[step.row]) for name, column in columns.items()}
+
+    def beliefs(self) -> Iterator[sparse.csr_array]:
+        """`[T · K, M]`, predicted in each step of each episode; see `Episode`."""
+        (episodes, targets), cells = self._shape, self._task.num_cells
+        taken, rows = list[Columns](), list[IndexArray]()
+        for t, step in enumerate(self._steps()):
+            moved = step.moved
+            episode, target = np.divmod(moved.row, targets)
+            place, mass = target + t * targets, moved.mass.astype(np.float32)
+            state = moved.state % cells
+            taken.append({"row": episode, "place": place, "cell": state, "mass": mass})
+            rows.append(step.row)
+        columns, counts = joined(taken)
+        lengths = np.bincount(np.concatenate(rows), minlength=episodes).tolist()
+        ends = np.cumsum(counts)[:-1]
+        parts = (np.split(columns[name], ends) for name in ("place", "cell", "mass"))
+        for place, cell, mass, length in zip(*parts, lengths, strict=True):
+            belief = sparse.csr_array((mass, (place, cell)), shape=(length * targets, cells))
+            belief.eliminate_zeros()
+            yield belief

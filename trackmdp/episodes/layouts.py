@@ -19,8 +19,9 @@ import numpy as np
 
 from trackmdp.durable import write_text
 from trackmdp.episodes.grids import PART
-from trackmdp.episodes.schema import LoggedRun, belief_topic
+from trackmdp.episodes.schema import belief_topic
 from trackmdp.episodes.target_colours import COLOURS, colour_of
+from trackmdp.world.group import Subject
 
 
 def layout(size: tuple[int, int], targets: int = 1) -> dict[str, Any]:
@@ -88,6 +89,7 @@ def _lines(size: tuple[int, int]) -> list[dict[str, Any]]:
     return [same | {"position": [x, y, 0.005]} for y, x in corners]
 
 
-def write_layout(file: Path, run: LoggedRun) -> None:
+def write_layout(file: Path, problem: Subject) -> None:
     """Write the layout of a log as JSON."""
-    write_text(file, json.dumps(layout(run.size, max(len(run.kinds), 1)), indent=2) + "\n")
+    made = layout(problem.single.size, max(len(problem.targets), 1))
+    write_text(file, json.dumps(made, indent=2) + "\n")

@@ -20,8 +20,7 @@ from trackmdp.policies.policy import Policy, PolicyLike
 from trackmdp.training.callbacks import Callback, Training
 from trackmdp.training.evaluator import Score
 from trackmdp.untrusted import reason
-from trackmdp.world.group import Group
-from trackmdp.world.problem import Problem
+from trackmdp.world.group import Subject
 
 
 class EpisodeLog:
@@ -44,7 +43,7 @@ class EpisodeLog:
     def __init__(
         self,
         folder: Path,
-        world: Problem | Group,
+        world: Subject,
         *,
         seed: int,
         config: str,
@@ -63,7 +62,7 @@ class EpisodeLog:
                 facts = {"seed": str(seed)}
                 self._writer = EpisodeWriter.of(self.file, world, facts=facts, config=config)
             if layout:
-                write_layout(folder / "episodes.layout.json", self._writer.run)
+                write_layout(folder / "episodes.layout.json", world)
 
     @property
     def part(self) -> Path:

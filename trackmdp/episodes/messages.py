@@ -1,31 +1,60 @@
-"""Episodes as messages, and read back from them: the form of the episodes of a log."""
+"""Episodes as messages, and read back from them: the form of the episodes of a log.
+
+Of several targets, numbers of all are in one message. For viewers, `/grid` has how many targets are expected in each
+cell, `/belief/K` where target K is, in the smallest rectangle around it, and `/targets` a disc for each target in a
+colour of its own, with its number; it is faint where the target was missed.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy import sparse
 
 from trackmdp.episodes.container import Said
 from trackmdp.episodes.episode import Episode
-from trackmdp.episodes.grids import grid_messages, read_grids
-from trackmdp.episodes.schema import LoggedRun, json_bytes, tick_of, time_of
+from trackmdp.episodes.grids import (
+    ACTIVE,
+    WHOLE_CELLS,
+    boxed,
+    boxes_of,
+    grid_messages,
+    part_text,
+    read_grid,
+    read_grids,
+    stamp_of,
+)
+from trackmdp.episodes.schema import (
+    belief_topic,
+    clock_of,
+    json_bytes,
+    modes_of,
+    tick_of,
+    time_of,
+)
+from trackmdp.episodes.target_colours import shares_of
 from trackmdp.errors import UserError
-from trackmdp.sensing.coverage import Coverage
+from trackmdp.world.group import Subject
+
+_BELIEF = np.dtype([("belief", "<f4")])
+_ABOVE, _UPRIGHT = 0.02, {"x": 0, "y": 0, "z": 0, "w": 1}
+_WHITE = {"r": 1, "g": 1, "b": 1, "a": 1}
+_FAINT = 0.4
+"""Opacity of a target that was missed."""
 
 
 class Form:
-    """The form of the episodes of one target; see `trackmdp.episodes.group_messages` for several.
+    """The form of the episodes of one target; see `GroupForm` for several.
 
     Args:
-        run: the log.
-        coverage: of its sensors; None where each sees its own cell.
+        problem: where the episodes took place.
     """
 
-    def __init__(self, run: LoggedRun, coverage: Coverage | None = None) -> None:
-        self.run, self._coverage = run, coverage
+    def __init__(self, problem: Subject) -> None:
+        self.problem, self.task = problem, problem.single
 
     @property
     def read_layers(self) -> Sequence[str]:
@@ -46,7 +75,7 @@ class Form:
             "length": len(episode),
             "return": float(episode.returns[-1]),
             "detections": int(episode.located.sum()),
-            "forced": int(episode.forced(self.run.t_max).sum()),
+            "forced": int(episode.forced(self.task.t_max).sum()),
             "terminated": episode.terminated,
             "truncated": episode.truncated,
             "start_time": str(time_of(first_tick)),
@@ -55,8 +84,8 @@ class Form:
 
     def steps(self, episode: Episode) -> Iterator[bytes]:
         """The `/step` messages; of several targets with a number of each in the place of one."""
-        (rows, columns), t = self.run.size, np.arange(len(episode))
-        there = episode.target < self.run.cells
+        (rows, columns), t = self.task.size, np.arange(len(episode))
+        there = episode.target < self.task.num_cells
         steps, ids = np.nonzero(episode.action)
         # np.nonzero lists (step, sensor) in order of steps: steps 0 0 1 3 with sensors 2 5 4 0. searchsorted finds
         # where steps 1, 2, 3 begin, 2 3 3, and split makes of those [2 5] [4] [] [0].
@@ -69,7 +98,7 @@ class Form:
             "last_cell": self._written(episode.last_cell),
             "active": active,
             "n_active": episode.action.sum(axis=1),
-            "forced": episode.forced(self.run.t_max),
+            "forced": episode.forced(self.task.t_max),
             "target": self._written(episode.target),
             "target_x": np.where(there, episode.target % columns, -1),
             # Cells are numbered from the top left, a plot's y axis points upwards: in 3 rows of 4, cell 5 is at x = 1,
@@ -90,12 +119,12 @@ class Form:
 
     def _written(self, cells: Any) -> Any:
         """Cells with -1 for none, which is M in an episode: a schema with null is refused by viewers, topic and all."""
-        return np.where(cells == self.run.cells, -1, cells)
+        return np.where(cells == self.task.num_cells, -1, cells)
 
     def layers(self, episode: Any, first_tick: int) -> Iterator[dict[str, bytes]]:
         """Of each step topic -> message, for viewers."""
-        covered = None if self._coverage is None else self._coverage.cells(episode.action)
-        return grid_messages(episode, self.run.size, first_tick, covered)
+        sensed = self.task.covered(episode.action)
+        return grid_messages(episode, self.task.size, first_tick, sensed)
 
     def decode(self, row: dict[str, Any], messages: Iterable[Said]) -> Episode:
         """The episode of a row, from messages among which are its own.
@@ -120,7 +149,7 @@ class Form:
         self, row: dict[str, Any], said: list[dict[str, Any]], mine: dict[str, list[bytes]]
     ) -> Episode:
         """The episode of a row, the contents of its steps, and its messages by topic."""
-        run, targets = self.run, len(self.run.kinds)
+        task, targets, has_mode = self.task, len(self.problem.targets), modes_of(self.problem) > 1
         misses, target, seen = (
             np.array([each[name] for each in said], dtype=np.int64)
             for name in ("n", "target", "obs")
@@ -130,11 +159,11 @@ class Form:
             each.shape != (len(said), *shape) for each in (misses, target, seen)
         ):
             raise ValueError(f"steps or starts of other than {targets or 1} targets")
-        action = np.zeros((len(said), run.sensors), dtype=bool)
+        action = np.zeros((len(said), task.total_sensors), dtype=bool)
         for t, each in enumerate(said):
             action[t, each["active"]] = True
-        start = np.where(start < 0, run.cells, start)
-        modes = np.array([each["mode"] for each in said], dtype=np.int64) if run.modes else None
+        start = np.where(start < 0, task.num_cells, start)
+        modes = np.array([each["mode"] for each in said], dtype=np.int64) if has_mode else None
         return Episode(
             number=row["episode"],
             seed=int(row["seed"]),
@@ -142,16 +171,89 @@ class Form:
             start=start if targets else int(start),
             misses=misses,
             action=action,
-            target=np.where(target < 0, run.cells, target),
+            target=np.where(target < 0, task.num_cells, target),
             located=seen >= 0,
             reward=np.array([each["reward"] for each in said], dtype=np.float32),
             mode=modes,
             first_tick=tick_of(int(row["start_time"])),
-            start_mode=row["start_mode"] if run.modes else 0,
+            start_mode=row["start_mode"] if has_mode else 0,
             **self._beliefs(mine),
         )
 
     def _beliefs(self, mine: dict[str, list[bytes]]) -> dict[str, Any]:
         """Beliefs and probabilities of an episode, from its messages by topic."""
-        belief, probability = read_grids(mine["/grid"], self.run.size)
+        belief, probability = read_grids(mine["/grid"], self.task.size)
         return {"belief": belief, "probability": probability}
+
+
+class GroupForm(Form):
+    """The form of the episodes of several targets."""
+
+    @property
+    def read_layers(self) -> Sequence[str]:
+        """See `Form`."""
+        return [belief_topic(target) for target in range(len(self.problem.targets))]
+
+    def layers(self, episode: Episode, first_tick: int) -> Iterator[dict[str, bytes]]:
+        """See `Form`."""
+        (rows, columns), targets = self.task.size, len(episode.start)
+        sensed = episode.action.reshape(-1, rows, columns)
+        for t, active in enumerate(boxes_of(sensed)):
+            stamp = stamp_of(first_tick + t)
+            each = episode.belief[t * targets : (t + 1) * targets].toarray()
+            # From the numbers that are logged, so that a log written anew has the same bytes.
+            every = each.sum(axis=0, dtype=np.float64).astype(np.float32)
+            beliefs = np.concatenate([every[None], each]).reshape(-1, rows, columns)
+            used = beliefs > 0
+            used[0] |= rows * columns <= WHOLE_CELLS
+            topics = ["/grid", *self.read_layers]
+            drawn = zip(topics, beliefs.view(_BELIEF), boxes_of(used), strict=True)
+            said = {topic: boxed(stamp, cells, box, 0) for topic, cells, box in drawn}
+            said["/active"] = boxed(stamp, sensed[t].view(ACTIVE), active, 0.01)
+            said["/targets"] = self._scene(episode, t, first_tick + t)
+            yield said | {"/part": part_text(stamp, columns / 2, rows / 2)}
+
+    def _scene(self, episode: Episode, t: int, tick: int) -> bytes:
+        """The targets that are in the grid, in place of those of the step before."""
+        rows, columns = self.task.size
+        time, entities = clock_of(tick), []
+        for k in np.flatnonzero(episode.target[t] < self.task.num_cells).tolist():
+            row, column = divmod(int(episode.target[t, k]), columns)
+            place = {"x": column + 0.5, "y": rows - row - 0.5}
+            colour = shares_of(k) | {"a": 1 if episode.located[t, k] else _FAINT}
+            size = {"x": 0.6, "y": 0.6, "z": 0.01}
+            disc = _at(place, _ABOVE, size=size, bottom_scale=1, top_scale=1, color=colour)
+            own = {"billboard": True, "font_size": 0.4, "scale_invariant": False, "color": _WHITE}
+            text = _at(place, 2 * _ABOVE, **own, text=str(k))
+            entity = {"timestamp": time, "frame_id": "grid", "id": f"target {k}"}
+            entities.append(entity | {"cylinders": [disc], "texts": [text]})
+        everything = {"timestamp": time, "type": 1, "id": ""}
+        return json_bytes({"deletions": [everything], "entities": entities})
+
+    def _beliefs(self, mine: dict[str, list[bytes]]) -> dict[str, Any]:
+        """See `Form`: `[T · K, M]` of the messages of each target."""
+        task, topics = self.task, self.read_layers
+        places = np.arange(task.num_cells).reshape(task.size)
+        rows, columns, masses = [], [], []
+        for k, topic in enumerate(topics):
+            for t, text in enumerate(mine[topic]):
+                part, cells = read_grid(text, task.size, _BELIEF)
+                mass, cell = cells["belief"].ravel(), places[part].ravel()
+                rows.append(np.full(len(cell), t * len(topics) + k))
+                columns.append(cell)
+                masses.append(mass)
+        entries = np.concatenate(masses), (np.concatenate(rows), np.concatenate(columns))
+        shape = len(mine[topics[0]]) * len(topics), task.num_cells
+        belief = sparse.csr_array(entries, shape=shape)
+        belief.eliminate_zeros()
+        return {"belief": belief}
+
+
+def _at(place: Mapping[str, float], height: float, **more: Any) -> dict[str, Any]:
+    """A part of an entity in a place of the grid, upright."""
+    return {"pose": {"position": {**place, "z": height}, "orientation": _UPRIGHT}, **more}
+
+
+def form_of(problem: Subject) -> Form:
+    """The form of the episodes of a log, of one target or of several; see `Form`."""
+    return (GroupForm if problem.targets else Form)(problem)

@@ -9,7 +9,7 @@ import sys
 import termios
 import time
 import tty
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -61,8 +61,7 @@ def frame(episode: Episode, t: int, task: Task) -> str:
     places = (np.atleast_1d(each) for each in (episode.target[t], before, episode.start))
     inside = (each[each < task.num_cells] for each in places)
     cells = next((each for each in inside if len(each)), np.atleast_1d(episode.start))
-    middle = (place // STEP * STEP + STEP // 2 for place in _amid(cells, task))
-    parts = _parts(middle, task, WIDE)
+    parts = _parts(cells, task, WIDE, STEP)
     rows = [" ".join(row) for row in marks[np.ix_(*parts)]]
     edge = "─" * (2 * len(parts[1]) + 1)
     return "\n".join(
@@ -70,20 +69,14 @@ def frame(episode: Episode, t: int, task: Task) -> str:
     )
 
 
-def _amid(cells: IndexArray, task: Task) -> tuple[int, int]:
-    """Row and column in the middle of some cells."""
-    way = np.array(np.divmod(cells, task.columns))
-    row, column = ((way.min(1) + way.max(1)) // 2).tolist()
-    return row, column
+def _parts(cells: IndexArray, task: Task, wide: int, step: int = 1) -> list[range]:
+    """The rows and columns that are drawn of a large grid: around some cells, moved `step` at once."""
+    sides = zip(np.divmod(cells, task.columns), task.size, strict=True)
+    middles = ((int(way.min() + way.max()) // 2, length) for way, length in sides)
+    return [around(at // step * step + step // 2, length, wide) for at, length in middles]
 
 
-def _parts(middle: Iterable[int], task: Task, wide: int) -> tuple[range, range]:
-    """The rows and columns that are drawn around a place of a large grid."""
-    row, column = middle
-    return around(row, task.rows, wide), around(column, task.columns, wide)
-
-
-def _cut(task: Task, parts: tuple[range, range]) -> list[str]:
+def _cut(task: Task, parts: Sequence[range]) -> list[str]:
     """The part that is drawn, in words, counted from 1; nothing where it is the whole grid."""
     if tuple(map(len, parts)) == task.size:
         return []
@@ -194,7 +187,7 @@ def draw_picture(episodes: Sequence[Episode], task: Task, *, steps: int = 6) -> 
     target = episode.target[:steps].reshape(min(steps, len(episode)), -1)
     inside = target < task.num_cells
     cells = target[inside] if inside.any() else np.atleast_1d(episode.start)
-    parts = _parts(_amid(cells, task), task, PICTURE_WIDE)
+    parts = _parts(cells, task, PICTURE_WIDE)
     columns, forced = [], episode.forced(task.t_max)
     for t in np.flatnonzero(inside.any(axis=1)).tolist():
         on = task.covered(episode.action[t]) | forced[t]

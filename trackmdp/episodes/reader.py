@@ -17,8 +17,8 @@ from trackmdp.config import train_config_of
 from trackmdp.episodes import schema
 from trackmdp.episodes.container import Container, Damaged, reading
 from trackmdp.episodes.differences import first_difference
-from trackmdp.episodes.group_messages import form_of
-from trackmdp.episodes.schema import LoggedRun, versions_apart
+from trackmdp.episodes.messages import form_of
+from trackmdp.episodes.schema import versions_apart
 from trackmdp.episodes.simulate import resimulate
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
@@ -27,8 +27,7 @@ from trackmdp.solvers.several.merging import Rule, make_rule
 from trackmdp.training.group_run import joint_policy
 from trackmdp.untrusted import load_npz
 from trackmdp.world.group import Group
-from trackmdp.world.problem import Problem
-from trackmdp.world.problem_file import PROBLEM, subject_in
+from trackmdp.world.problem_file import PROBLEM
 
 
 class EpisodeReader:
@@ -47,7 +46,6 @@ class EpisodeReader:
     def __init__(self, file: Path | str) -> None:
         self.file = Path(file)
         self._container = Container(self.file)
-        self._built: Problem | Group | None = None
         # A constructor that raises leaves nobody to close the file.
         with ExitStack() as opened, reading(self.file):
             opened.callback(self.close)
@@ -56,11 +54,11 @@ class EpisodeReader:
 
     def _open(self) -> None:
         try:
-            said = self._metadata(schema.RUN)
+            self.said = self._metadata(schema.RUN)
         except Damaged as error:
             raise UserError(f"file={self.file}: not a log of trackmdp ({error})") from error
-        self.run = LoggedRun(self.file, said)
-        self._form = form_of(self.run)
+        schema.check_format(self.file, self.said)
+        self.form = form_of(schema.logged_problem(self.said, self.attachment(PROBLEM)))
         self.end = self._metadata(schema.END)
         count = int(self.end["policies"])
         # One by one: a count that is too large ends at the first name that is missing.
@@ -109,19 +107,19 @@ class EpisodeReader:
         row = self.row(number)
         with reading(self.file):
             ends = int(row["start_time"]), int(row["end_time"])
-            return self._form.decode(row, self._container.messages_around(*ends))
+            return self.form.decode(row, self._container.messages_around(*ends))
 
     def attachment(self, name: str, sha256: str | None = None) -> bytes:
         """An attachment with its digest, by default that of `trackmdp.run`."""
         with reading(self.file):
             content = self._container.attachment(name)
-            if schema.digest(content) != (sha256 or self.run.said.get(f"{name}.sha256")):
+            if schema.digest(content) != (sha256 or self.said.get(f"{name}.sha256")):
                 raise Damaged(f"the digest of attachment {name}")
         return content
 
     def policy_tables(self, number: int) -> list[bytes]:
         """The files of policy `number`, one for each motion; empty if it has no table."""
-        tables = self.run.policy_tables(number, self.policies[number])
+        tables = schema.policy_tables(number, self.policies[number])
         return [self.attachment(*each) for each in tables.items()]
 
     def policy(self, number: int) -> Policy | Rule:
@@ -150,19 +148,7 @@ class EpisodeReader:
 
     def world(self) -> Any:
         """The world in which the episodes were recorded, the tracks along which they were, or a `Group` of targets."""
-        # Kept, since every episode that becomes a TensorDict needs it.
-        if self._built is None:
-            with reading(self.file):
-                self._built = self._world()
-        return self._built
-
-    def _world(self) -> Problem | Group:
-        run, problem = self.run, subject_in(io.BytesIO(self.attachment(PROBLEM)))
-        task = problem.task
-        found = task.size, task.total_sensors, task.t_max, problem.targets
-        if found != (run.size, run.sensors, run.t_max, run.kinds):
-            raise Damaged(PROBLEM)
-        return problem
+        return self.form.problem
 
     def check_all(self) -> None:
         """Check every byte of the file, those without meaning to this reader included."""
@@ -199,7 +185,7 @@ def verify(reader: EpisodeReader, *, numbers: list[int] | None = None) -> Verifi
         reader.check_all()
     rows = reader.rows if numbers is None else [reader.row(number) for number in numbers]
     # The belief is a sum of products, which another version or processor may add up in another order.
-    tolerance = BELIEF_TOLERANCE if versions_apart(reader.run.said) else 0.0
+    tolerance = BELIEF_TOLERANCE if versions_apart(reader.said) else 0.0
     world, done, steps = reader.world(), 0, 0
     at_once = max(64, min(_AT_ONCE, _CELLS // world.task.num_cells))
     for number, group in groupby(rows, lambda row: row["policy"]):

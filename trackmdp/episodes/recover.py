@@ -14,8 +14,7 @@ from mcap.records import Attachment, Chunk, DataEnd, Metadata
 
 from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged, Said
-from trackmdp.episodes.group_messages import form_of
-from trackmdp.episodes.schema import TABLES, LoggedRun
+from trackmdp.episodes.schema import TABLES
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
 from trackmdp.untrusted import reason
@@ -41,8 +40,7 @@ def recover(file: Path) -> Recovered:
     # Not overwritten: it may be the result of an earlier recovery, and `file` may have been damaged further.
     if target.exists():
         raise UserError(f"file={file}: {target} already exists")
-    damaged: list[str] = []
-    writer = _rewrite(file, target, damaged)
+    writer, damaged = _rewrite(file, target)
     if writer is None:
         lost = "its metadata or its problem are lost"
         raise UserError(f"file={file}: too damaged, {lost} ({'; '.join(damaged)})")
@@ -54,7 +52,7 @@ def taken_over(file: Path, target: Path, policies: int) -> EpisodeWriter | None:
 
     None if they are not all there; `target` is then not left behind.
     """
-    writer = _rewrite(file, target, [], most=policies)
+    writer, _ = _rewrite(file, target, policies)
     if writer is not None:
         if writer.policies < policies:
             writer.abandon()
@@ -65,11 +63,12 @@ def taken_over(file: Path, target: Path, policies: int) -> EpisodeWriter | None:
 
 
 class _Parts:
-    """Metadata with a whole seal and attachments, by name."""
+    """Parts of a log that are whole, by name: metadata with their seal, and attachments; and all that was damaged."""
 
     def __init__(self) -> None:
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, bytes] = {}
+        self.damaged: list[str] = []
 
     def attached(self, name: str, sha256: str | None) -> bytes:
         """An attachment with the digest `sha256`."""
@@ -78,90 +77,87 @@ class _Parts:
             raise Damaged(f"{name} is lost")
         return content
 
+    @contextmanager
+    def noting(self) -> Iterator[None]:
+        """Note the errors of damaged parts: the next part may be whole."""
+        try:
+            yield
+        except OSError:  # of the disk
+            raise
+        except Exception as error:
+            self.damaged.append(reason(error))
+
+    def messages(self, stream: BinaryIO) -> Iterator[Said]:
+        """The messages of every whole chunk; attachments and metadata are kept."""
+        topics: dict[int, str] = {}
+        offset = len(container.MAGIC)
+        while frame := container.frame_at(stream, offset):
+            offset += len(frame)
+            found: list[Said] = []
+            with self.noting():
+                record = container.record_of(frame)
+                if isinstance(record, DataEnd):
+                    return
+                if isinstance(record, Metadata):
+                    self.metadata[record.name] = schema.unseal(record.name, record.metadata)
+                elif isinstance(record, Attachment):
+                    self.attachments[record.name] = record.data
+                elif isinstance(record, Chunk):
+                    found = container.messages_of(record, topics)
+            yield from found
+
+    def begin(self, file: Path, target: Path) -> EpisodeWriter | None:
+        """The new log, if all that it begins with has been found."""
+        if schema.RUN in self.metadata:
+            said = self.metadata[schema.RUN]
+            schema.check_format(file, said)
+            with self.noting():
+                # Without the problem, the log could not be simulated again.
+                tables = {n: self.attached(n, said.get(f"{n}.sha256")) for n in TABLES}
+                return EpisodeWriter(target, said, tables)
+        return None
+
+    def add_policies(self, writer: EpisodeWriter, count: int) -> None:
+        """Copy policies until there are `count`."""
+        # One after another: the number of a policy is its place.
+        for each in range(writer.policies, count):
+            facts = self.metadata[f"{schema.POLICY}.{each}"]
+            tables = [self.attached(*it) for it in schema.policy_tables(each, facts).items()]
+            writer.flush()  # as when it was recorded, so that a copy has the same bytes
+            writer.copy_policy(facts, tables)
+
 
 def _rewrite(
-    file: Path, target: Path, damaged: list[str], most: float = math.inf
-) -> EpisodeWriter | None:
+    file: Path, target: Path, most: float = math.inf
+) -> tuple[EpisodeWriter | None, list[str]]:
     """Copy the whole parts of the first `most` policies and their episodes; None without metadata and problem."""
     # From front to back, since a log that was cut off has no index: the messages of an episode are held until the
     # `/episode` message, which is its last one.
     parts, held = _Parts(), list[Said]()
     writer: EpisodeWriter | None = None
     with container.opened_log(file) as stream:
-        for message in _messages(stream, parts, damaged):
+        for message in parts.messages(stream):
             held.append(message)
             if message[0] != "/episode":
                 continue
-            writer = writer or _begin(file, target, parts, damaged)
-            with _noting(damaged):
+            writer = writer or parts.begin(file, target)
+            with parts.noting():
                 if writer is None:
                     raise Damaged("an episode without metadata or problem")
                 row = json.loads(message[2])
                 # A resumed run records the episodes of later policies again.
                 if row["policy"] >= most:
                     break
-                _add_policies(writer, parts, row["policy"] + 1)
+                parts.add_policies(writer, row["policy"] + 1)
                 # Messages of another episode may be held as well, one with an end that was lost.
-                writer.add(form_of(writer.run).decode(row, held))
+                writer.add(writer.form.decode(row, held))
             held.clear()
-        writer = writer or _begin(file, target, parts, damaged)
+        writer = writer or parts.begin(file, target)
     if held or schema.END not in parts.metadata:
-        damaged.append("the end is missing")
+        parts.damaged.append("the end is missing")
     if writer is not None:
         # Policies without a whole episode too: `taken_over` counts them.
         found = sum(name.startswith(f"{schema.POLICY}.") for name in parts.metadata)
-        with _noting(damaged):
-            _add_policies(writer, parts, int(min(found, most)))
-    return writer
-
-
-@contextmanager
-def _noting(damaged: list[str]) -> Iterator[None]:
-    """Note the errors of damaged parts: the next part may be whole."""
-    try:
-        yield
-    except OSError:  # of the disk
-        raise
-    except Exception as error:
-        damaged.append(reason(error))
-
-
-def _messages(stream: BinaryIO, parts: _Parts, damaged: list[str]) -> Iterator[Said]:
-    """The messages of every whole chunk; attachments and metadata go to `parts`."""
-    topics: dict[int, str] = {}
-    offset = len(container.MAGIC)
-    while frame := container.frame_at(stream, offset):
-        offset += len(frame)
-        found: list[Said] = []
-        with _noting(damaged):
-            record = container.record_of(frame)
-            if isinstance(record, DataEnd):
-                return
-            if isinstance(record, Metadata):
-                parts.metadata[record.name] = schema.unseal(record.name, record.metadata)
-            elif isinstance(record, Attachment):
-                parts.attachments[record.name] = record.data
-            elif isinstance(record, Chunk):
-                found = container.messages_of(record, topics)
-        yield from found
-
-
-def _begin(file: Path, target: Path, parts: _Parts, damaged: list[str]) -> EpisodeWriter | None:
-    """The new log, if all that it begins with has been found."""
-    if schema.RUN in parts.metadata:
-        run = LoggedRun(file, parts.metadata[schema.RUN])
-        with _noting(damaged):
-            # Without the problem, the log could not be simulated again.
-            tables = {n: parts.attached(n, run.said.get(f"{n}.sha256")) for n in TABLES}
-            return EpisodeWriter(target, run, tables)
-    return None
-
-
-def _add_policies(writer: EpisodeWriter, parts: _Parts, count: int) -> None:
-    """Copy policies until there are `count`."""
-    # One after another: the number of a policy is its place.
-    for each in range(writer.policies, count):
-        facts = parts.metadata[f"{schema.POLICY}.{each}"]
-        tables = [parts.attached(*it) for it in writer.run.policy_tables(each, facts).items()]
-        writer.flush()  # as when it was recorded, so that a copy has the same bytes
-        writer.copy_policy(facts, tables)
+        with parts.noting():
+            parts.add_policies(writer, int(min(found, most)))
+    return writer, parts.damaged

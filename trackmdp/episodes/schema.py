@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import itertools
 import json
-import math
 import platform
 from collections.abc import Mapping
 from importlib.metadata import version
@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from trackmdp import __version__
-from trackmdp.config.several import MOST_TARGETS
 from trackmdp.errors import UserError
-from trackmdp.untrusted import decoded
-from trackmdp.world.problem_file import PROBLEM
+from trackmdp.world.group import Subject
+from trackmdp.world.problem_file import PROBLEM, subject_in
 
 LOG_FORMAT = "5"
 """Version of this layout; a reader refuses any other."""
@@ -48,77 +47,33 @@ def tick_of(log_time: int) -> int:
     return (log_time - _BASE_NS) // TICK_NS
 
 
-_FIELDS = json.loads(
+_LISTED = json.loads(
     files("trackmdp.episodes").joinpath("schemas.json").read_text(encoding="utf-8")
 )
-"""Name of a schema -> its properties, in the order in which messages have them."""
-
-_GRID, _ROWS = "foxglove.Grid", "; the first row is the lowest"
-_TOPICS = {
-    "/step": (
-        "trackmdp.Step",
-        "One step: state and action before the move, outcome after it",
-    ),
-    "/grid": (
-        "foxglove.Grid",
-        f"belief and policy of every cell, of large grids of the part where they are not 0{_ROWS}",
-    ),
-    "/active": (_GRID, f"the cells sensed, in the smallest rectangle around them{_ROWS}"),
-    "/target": (_GRID, f"the true cell of the target{_ROWS}"),
-    "/part": (
-        "foxglove.FrameTransform",
-        "the middle of the part of a large grid that the target is in",
-    ),
-    "/episode": ("trackmdp.Episode", "One episode, at the time of its last step"),
-}
-
-
-def _schema(name: str, title: str) -> dict[str, Any]:
-    return {"title": title, "type": "object", "properties": _FIELDS[name]}
-
-
-SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
-    topic: (name, _schema(name, title)) for topic, (name, title) in _TOPICS.items()
-}
-"""Topic -> (name of its schema, JSON schema), within the subset that viewers read: no null, no array of arrays.
+"""Topics of a log of one target and of several -> name and title of their schema; name -> its properties, as ordered in
+messages. They are within the subset that viewers read: no null, no array of arrays.
 
 Cells are numbered row by row from the top left; -1 stands for no cell: a target that exited, nothing observed.
 """
-
-_INTEGER = {"type": "integer"}
-_EACH_TARGET = {"type": "array", "items": _INTEGER}
-_OF_SEVERAL: dict[str, dict[str, Any]] = {
-    "/step": dict.fromkeys(
-        ("n", "last_cell", "target", "target_x", "target_y", "obs"), _EACH_TARGET
-    )
-    | {"n_present": _INTEGER},
-    "/episode": {"start": _EACH_TARGET},
-}
-"""Topic -> properties of its messages, in logs of several targets."""
-
-
-def _with(topic: str, fields: dict[str, Any], kind: str = ".") -> tuple[str, dict[str, Any]]:
-    """The schema of a topic with other or further properties; `kind` takes the place of the point in its name."""
-    name, said = SCHEMAS[topic]
-    return name.replace(".", kind), said | {"properties": said["properties"] | fields}
+_BELIEF = "/belief/{}"
 
 
 def belief_topic(target: int) -> str:
     """The topic of where one of several targets is expected."""
-    return f"/belief/{target}"
+    return _BELIEF.format(target)
 
 
-def schemas_of_several(targets: int) -> dict[str, tuple[str, dict[str, Any]]]:
-    """`SCHEMAS` of a log of K targets."""
-    scene = ("foxglove.SceneUpdate", _schema("foxglove.SceneUpdate", "the targets, by number"))
-    single = {topic: SCHEMAS[topic] for topic in ("/grid", "/active", "/part")}
-    of_each = {belief_topic(each): SCHEMAS["/grid"] for each in range(targets)}
-    steps = {topic: _with(topic, fields, ".Group") for topic, fields in _OF_SEVERAL.items()}
-    return steps | single | of_each | {"/targets": scene}
-
-
-MODE = {"/step": {"mode": _INTEGER}, "/episode": {"start_mode": _INTEGER}}
-"""Topic -> further properties of its messages, in logs of targets with a mode."""
+def schemas_of(problem: Subject) -> dict[str, tuple[str, dict[str, Any]]]:
+    """Topic -> (name of its schema, JSON schema) of a log of `problem`."""
+    targets, found = problem.targets, {}
+    for topic, (name, title) in _LISTED["topics"]["several" if targets else "one"].items():
+        properties = _LISTED["properties"][name]
+        if modes_of(problem) > 1:
+            properties = properties | _LISTED["properties"].get(f"{name} with modes", {})
+        said = {"title": title, "type": "object", "properties": properties}
+        for target in range(len(targets) if topic == _BELIEF else 1):
+            found[topic.format(target)] = name, said
+    return found
 
 
 _JSON = json.JSONEncoder(allow_nan=False, separators=(",", ":"))
@@ -190,47 +145,50 @@ def table_digest(kind: int) -> str:
     return "table.sha256" if kind == 0 else f"table-{kind}.sha256"
 
 
-class LoggedRun:
-    """The metadata `trackmdp.run` of a log.
+def policy_tables(number: int, facts: Mapping[str, str]) -> dict[str, str]:
+    """Name -> digest of the attachments with the tables of a policy; empty where it has none."""
+    kinds = itertools.takewhile(lambda kind: facts.get(table_digest(kind)), itertools.count())
+    return {policy_file(number, kind): facts[table_digest(kind)] for kind in kinds}
 
-    Attributes:
-        said: the metadata themselves.
-        size: (rows, columns) of the grid.
-        cells: M.
-        sensors: S.
-        modes: of the targets; 0 where they have none.
-        t_max: T_max.
-        kinds: of several targets, for each the number of its motion; empty in a log of one target.
+
+def modes_of(problem: Subject) -> int:
+    """H; 1 where targets have no modes."""
+    return getattr(problem.single, "modes", 1)
+
+
+def shape_of(problem: Subject) -> dict[str, str]:
+    """The entries of `trackmdp.run` on the grid, the targets and T_max, for readers without this package."""
+    task, modes = problem.single, modes_of(problem)
+    return {
+        "size": str(task.rows),
+        **({} if task.rows == task.columns else {"columns": str(task.columns)}),
+        **({} if task.coverage is None else {"sensors": str(task.total_sensors)}),
+        **({} if modes == 1 else {"modes": str(modes)}),
+        **({"targets": " ".join(map(str, problem.targets))} if problem.targets else {}),
+        "t_max": str(task.t_max),
+    }
+
+
+def check_format(file: Path, said: Mapping[str, str]) -> None:
+    """Check the format in the metadata `trackmdp.run` of a log.
 
     Raises:
-        UserError: they are of another format, or describe no world; the message names `file`.
+        UserError: it is another one.
     """
+    if (found := said.get("format_version")) != LOG_FORMAT:
+        writer = said.get("trackmdp", "unknown")
+        raise UserError(
+            f"file={file}: format {found} (trackmdp {writer}), expected format {LOG_FORMAT}"
+        )
 
-    def __init__(self, file: Path, said: Mapping[str, str]) -> None:
-        if (found := said.get("format_version")) != LOG_FORMAT:
-            writer = said.get("trackmdp", "unknown")
-            raise UserError(
-                f"file={file}: format {found} (trackmdp {writer}), expected format {LOG_FORMAT}"
-            )
-        with decoded(f"file={file}", "a log of trackmdp"):
-            self.said, rows = dict(said), int(said["size"])
-            self.size = rows, int(said.get("columns", rows))
-            self.cells = math.prod(self.size)
-            self.sensors = int(said.get("sensors", self.cells))
-            self.modes, self.t_max = int(said.get("modes", 0)), int(said["t_max"])
-            self.kinds = tuple(map(int, said.get("targets", "").split()))
-            if len(self.kinds) > MOST_TARGETS:
-                raise ValueError("too many targets")
 
-    def policy_tables(self, number: int, facts: Mapping[str, str]) -> dict[str, str]:
-        """Name -> digest of the attachments with the tables of a policy; empty where it has none."""
-        kinds = itertools.takewhile(lambda kind: facts.get(table_digest(kind)), itertools.count())
-        return {policy_file(number, kind): facts[table_digest(kind)] for kind in kinds}
+def logged_problem(said: Mapping[str, str], content: bytes) -> Subject:
+    """The problem in a log's `problem.npz`; call it inside `untrusted.decoded`.
 
-    @property
-    def schemas(self) -> dict[str, tuple[str, dict[str, Any]]]:
-        """Topic -> (name of its schema, JSON schema)."""
-        if self.kinds:
-            return schemas_of_several(len(self.kinds))
-        modes = MODE if self.modes else {}
-        return SCHEMAS | {topic: _with(topic, fields) for topic, fields in modes.items()}
+    Raises:
+        ValueError: the metadata `trackmdp.run` are of another problem.
+    """
+    problem = subject_in(io.BytesIO(content))
+    if not shape_of(problem).items() <= said.items():
+        raise ValueError(f"metadata {RUN} of another {PROBLEM}")
+    return problem

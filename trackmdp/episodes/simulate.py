@@ -17,8 +17,7 @@ from trackmdp.environment.paths import PathSampler, path_sampler
 from trackmdp.episodes.actors import Actor, States, actor_of
 from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.episode_draws import Columns, Draws, joined, narrow, uniform
-from trackmdp.episodes.group_episodes import GroupEpisodes
-from trackmdp.episodes.group_simulate import group_columns
+from trackmdp.episodes.group_episodes import GroupEpisodes, batches
 from trackmdp.errors import UserError
 from trackmdp.machine import check_free
 from trackmdp.policies.acting import Playback
@@ -29,7 +28,7 @@ from trackmdp.solvers.evaluate import group_rule
 from trackmdp.solvers.several.merging import Rule
 from trackmdp.solvers.solve import named_policy
 from trackmdp.solvers.value import check_revealed
-from trackmdp.world.group import Group, check_problem
+from trackmdp.world.group import Group, Subject, check_problem
 from trackmdp.world.problem import Problem
 
 
@@ -55,7 +54,7 @@ def simulate(
 
 
 def simulate(
-    problem: Problem | Group,
+    problem: Subject,
     policy: PolicyLike | Playback | Rule,
     episodes: int,
     *,
@@ -115,16 +114,15 @@ def episode_seeds(seed: int, episodes: int, *names: str | int) -> list[int]:
 
 
 @torch.no_grad()
-def resimulate(
-    problem: Problem | Group, policy: PolicyLike | Playback | Rule, seeds: Sequence[int]
-) -> Any:
+def resimulate(problem: Subject, policy: PolicyLike | Playback | Rule, seeds: Sequence[int]) -> Any:
     """`Episodes` or `GroupEpisodes`: one episode for each of `seeds`, in their order, each independent of the others.
 
     See `simulate`.
     """
     if isinstance(policy, Rule):
         # Of no episode one is simulated, as below.
-        return GroupEpisodes.of(policy.group, policy, seeds, group_columns(policy, seeds or [0]))
+        columns = [each.run() for each in batches(policy, seeds or [0])]
+        return GroupEpisodes.of(policy.group, policy, seeds, columns)
     assert not isinstance(problem, Group)
     outcomes, sampler = Outcomes(problem), path_sampler(problem, held_out=True)
     actor = actor_of(problem.task, policy, Costs(problem))
@@ -197,17 +195,17 @@ class _Batch:
         # An exit on the last step allowed is an exit (terminated), not a truncation.
         truncated = self._truncated(place, at.step) & in_grid
         mode = self._sampler.mode(place)
-        columns = {"key": at.key} if self._keys.num_classes > 1 else {}
-        columns |= {} if mode is None else {"mode": mode}
-        columns |= {"misses": at.misses, "target": target, "located": located}
-        columns |= {"reward": outcome.reward}
-        columns |= {"row": at.row, "sensors": choice.count, "truncated": truncated}
-        bits = (
-            {} if choice.action is None else {"bits": np.packbits(choice.action.numpy(), axis=-1)}
-        )
-        self._taken.append(
-            {name: narrow(column.numpy()) for name, column in columns.items()} | bits
-        )
+        columns = {"misses": at.misses, "target": target, "located": located}
+        columns |= {"reward": outcome.reward, "row": at.row, "sensors": choice.count}
+        columns |= {"truncated": truncated}
+        if self._keys.num_classes > 1:
+            columns["key"] = at.key
+        if mode is not None:
+            columns["mode"] = mode
+        taken = {name: narrow(column.numpy()) for name, column in columns.items()}
+        if choice.action is not None:
+            taken["bits"] = np.packbits(choice.action.numpy(), axis=-1)
+        self._taken.append(taken)
         # `[R']`, the positions of those still running: only they are carried over, so that a step's cost falls as
         # episodes end.
         going_on = (in_grid & ~truncated).nonzero().squeeze(-1)
@@ -219,7 +217,6 @@ class _Batch:
 
     def _truncated(self, place: Tensor, step: int) -> Tensor:
         """`[R]` whether this step is the last one allowed, or the last one recorded."""
-        if self._task.max_steps is not None and step + 1 >= self._task.max_steps:
-            return torch.ones_like(place, dtype=torch.bool)
+        last = self._task.max_steps is not None and step + 1 >= self._task.max_steps
         stops = self._sampler.stops(place)
-        return torch.zeros_like(place, dtype=torch.bool) if stops is None else stops
+        return torch.full_like(place, last, dtype=torch.bool) if stops is None else stops | last

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from trackmdp.arrays.types import Array
 
 
@@ -33,24 +31,7 @@ class Simulation:
     expected_length: MeanEstimate
 
 
-def simulation(totals: Array) -> Simulation:
-    """The figures of E episodes from `[6, E]` sums over their steps.
-
-    The rows of `totals` are reward, steps in the grid, detections, sensors on by choice, safe actions, and steps.
-    """
-    reward, steps, detections, sensors, forced, length = totals
-    every = np.ones(len(reward))
-    return Simulation(
-        episodes=len(reward),
-        aihtr=_ratio(reward, every),
-        accuracy=_ratio(detections, steps),
-        sensors_per_step=_ratio(sensors, steps),
-        safe_per_episode=_ratio(forced, every),
-        expected_length=_ratio(length, every),
-    )
-
-
-def _ratio(part: Array, whole: Array) -> MeanEstimate:
+def mean_ratio(part: Array, whole: Array) -> MeanEstimate:
     """Σ part / Σ whole; its standard error by the delta method.
 
     The ratio R = mean(p) / mean(w) errs to first order by mean(p - R w) / mean(w), a mean over episodes.

@@ -11,8 +11,7 @@ def colour_of(target: int) -> str:
     return COLOURS[target % len(COLOURS)]
 
 
-def shares_of(target: int) -> tuple[float, float, float]:
-    """The same as shares of red, green and blue, 0 to 1."""
-    code = colour_of(target)
-    red, green, blue = (round(int(code[at : at + 2], 16) / 255, 3) for at in (1, 3, 5))
-    return red, green, blue
+def shares_of(target: int) -> dict[str, float]:
+    """The same as shares of red, green and blue, 0 to 1, called r, g and b."""
+    places = zip("rgb", bytes.fromhex(colour_of(target)[1:]), strict=True)
+    return {name: round(each / 255, 3) for name, each in places}

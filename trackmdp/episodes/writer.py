@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,15 +14,14 @@ from trackmdp.arrays.files import npz_bytes
 from trackmdp.durable import create, sync, sync_folder
 from trackmdp.episodes import schema
 from trackmdp.episodes.episode import Episode
-from trackmdp.episodes.group_messages import form_of
-from trackmdp.episodes.schema import LoggedRun, time_of
+from trackmdp.episodes.messages import form_of
+from trackmdp.episodes.schema import time_of
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import packed
 from trackmdp.solvers.several.merging import Rule
 from trackmdp.untrusted import decoded
-from trackmdp.world.group import Group
-from trackmdp.world.problem import Problem
-from trackmdp.world.problem_file import PROBLEM, problem_bytes, subject_in
+from trackmdp.world.group import Group, Subject
+from trackmdp.world.problem_file import PROBLEM, problem_bytes
 
 FLUSH_STEPS = 100
 """An episode's end closes the chunk once so many steps are in it, and hands it to the operating system."""
@@ -37,13 +35,13 @@ class EpisodeWriter:
 
     Args:
         file: the log; its folder exists.
-        run: the metadata `trackmdp.run` that it begins with.
+        said: the metadata `trackmdp.run` that it begins with.
         tables: the attachments that they name: the world of all its episodes, so that it can be re-simulated.
     """
 
     @classmethod
     def of(
-        cls, file: Path, problem: Problem | Group, *, facts: Mapping[str, str], config: str
+        cls, file: Path, problem: Subject, *, facts: Mapping[str, str], config: str
     ) -> EpisodeWriter:
         """A log of `problem`, of recorded tracks those held out.
 
@@ -56,36 +54,27 @@ class EpisodeWriter:
         Raises:
             UserError: the problem is too large for a log.
         """
-        logged, more = problem, {}
-        if isinstance(problem, Group):
-            more = {"targets": " ".join(map(str, problem.targets))}
+        logged = problem
         if (own := problem.recorded) is not None:
             judged = own.held_out
             # Those to learn from predict the moves of several targets.
-            own = replace(own, tracks=own.tracks if more else judged, validation=judged, loaded={})
+            tracks = own.tracks if problem.targets else judged
+            own = replace(own, tracks=tracks, validation=judged, loaded={})
             logged = replace(problem, recorded=own) if isinstance(problem, Group) else own
         tables = {schema.TABLES[0]: config.encode(), PROBLEM: problem_bytes(logged)}
-        problem = problem.single
-        modes = getattr(problem, "modes", 1)
         said = {
             **schema.versions(),
             **facts,
             "format_version": schema.LOG_FORMAT,
-            "size": str(problem.rows),
-            **({} if problem.rows == problem.columns else {"columns": str(problem.columns)}),
-            **({} if problem.coverage is None else {"sensors": str(problem.total_sensors)}),
-            **({} if modes == 1 else {"modes": str(modes)}),
-            **more,
-            "t_max": str(problem.t_max),
+            **schema.shape_of(problem),
             "tick_ns": str(schema.TICK_NS),
             **{f"{name}.sha256": schema.digest(content) for name, content in tables.items()},
         }
-        return cls(file, LoggedRun(file, said), tables)
+        return cls(file, said, tables)
 
-    def __init__(self, file: Path, run: LoggedRun, tables: Mapping[str, bytes]) -> None:
-        self.run = run
+    def __init__(self, file: Path, said: dict[str, str], tables: Mapping[str, bytes]) -> None:
         with decoded(f"file={file}", "a log of trackmdp"):
-            self._form = form_of(run, subject_in(io.BytesIO(tables[PROBLEM])).task.coverage)
+            self.form = form_of(schema.logged_problem(said, tables[PROBLEM]))
         self.file, self.part = file, file.with_name(f"{file.name}.part")
         self._rows: list[dict[str, Any]] = []
         self.policies = self._unflushed = self._tick = 0
@@ -93,14 +82,14 @@ class EpisodeWriter:
         # CRCs over the data section are off by default; `Container.check_data` needs them.
         self._stream = create(self.part)
         self._writer = Writer(self._stream, enable_data_crcs=True)
-        self._writer.start(library=f"trackmdp {run.said['trackmdp']}")
+        self._writer.start(library=f"trackmdp {said['trackmdp']}")
         # Once, and the numbers kept: registering a topic a second time would make a second channel of the same name.
         self._channels: dict[str, int] = {}
-        for topic, (name, description) in run.schemas.items():
+        for topic, (name, description) in schema.schemas_of(self.form.problem).items():
             text = schema.json_bytes(description)
             number = self._writer.register_schema(name, "jsonschema", text)
             self._channels[topic] = self._writer.register_channel(topic, "json", number)
-        self._tell(schema.RUN, run.said)
+        self._tell(schema.RUN, said)
         for name, content in tables.items():
             self._attach(name, content)
         # In the file at once: a log that is cut off later can be recovered only with its head.
@@ -147,15 +136,7 @@ class EpisodeWriter:
             OSError: the disk is full, or the file cannot be written for another reason.
         """
         tick = self._tick if episode.first_tick is None else episode.first_tick
-        row = self._form.row(episode, tick)
-        self._add_messages(episode, tick, row)
-        self._rows.append(row)
-        self._tick = tick + len(episode) + schema.GAP
-        self._unflushed += len(episode)
-        if self._unflushed >= FLUSH_STEPS:
-            self.flush()
-
-    def _add_messages(self, episode: Episode, tick: int, row: dict[str, Any]) -> None:
+        row = self.form.row(episode, tick)
         # Before the first message of the episode: NaN is no JSON, and a time that does not fit into its field makes
         # the Writer raise within a chunk, which finish() could then no longer write.
         if not (np.isfinite(episode.reward).all() and 0 <= tick < 2**37):
@@ -163,14 +144,18 @@ class EpisodeWriter:
                 f"episode {episode.number}: a reward that is not finite, or a time out of range"
             )
         add, channels = self._writer.add_message, self._channels
-        steps, grids = self._form.steps(episode), self._form.layers(episode, tick)
+        steps, grids = self.form.steps(episode), self.form.layers(episode, tick)
         for place, (said, layers) in enumerate(zip(steps, grids, strict=True), start=tick):
             # MCAP's sequence number has 32 bits, the log time 64.
             time, sequence = time_of(place), place & 0xFFFFFFFF
             for topic, text in ({"/step": said} | layers).items():
                 add(channels[topic], time, text, time, sequence)
-        text = schema.json_bytes(row)
-        add(channels["/episode"], time, text, time, sequence)
+        add(channels["/episode"], time, schema.json_bytes(row), time, sequence)
+        self._rows.append(row)
+        self._tick = tick + len(episode) + schema.GAP
+        self._unflushed += len(episode)
+        if self._unflushed >= FLUSH_STEPS:
+            self.flush()
 
     def flush(self) -> None:
         """Close the chunk and hand it to the operating system: it then survives a kill of this process."""

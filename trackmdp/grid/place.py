@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from typing import Any
@@ -152,21 +152,6 @@ class Place:
             "cell_side": repr(self.cell),
             "cell_of": f"{column}; row = {row}; cell = row * {columns} + column",
         }
-
-
-def place_arrays(place: Place) -> dict[str, npt.NDArray[Any]]:
-    """A place as arrays; a code that is None has none."""
-    known = {name: value for name, value in place.facts().items() if value is not None}
-    return {name: np.asarray(value) for name, value in known.items()}
-
-
-def place_in(arrays: Mapping[str, npt.NDArray[Any]]) -> Place:
-    """The place of `place_arrays`.
-
-    Raises:
-        TypeError, ValueError: they are not those of a place.
-    """
-    return Place(**{name: array.tolist() for name, array in arrays.items()})
 
 
 def projected(crs: str | None, origin: Sequence[float]) -> tuple[float, float]:

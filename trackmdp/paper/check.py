@@ -36,9 +36,9 @@ class Check(NamedTuple):
     note: str = ""
     closed: bool = True
 
-    def judged(self, scale: float, *, closed: bool = True) -> Check:
+    def judged(self, scale: float) -> Check:
         """The check with `holds`: whether the deviation is at most `scale`."""
-        return self._replace(holds=self.deviation <= scale, closed=self.closed and closed)
+        return self._replace(holds=self.deviation <= scale)
 
     def of_cases(self, due: int) -> Check:
         """The check, failed if it has looked at no case where there are `due` cases, counted in another way."""

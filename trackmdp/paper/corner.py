@@ -18,8 +18,7 @@ def corner(world: World) -> World:
     rows, columns = (min(SIDE, side) for side in world.size)
     row, column = np.divmod(np.arange(rows * columns), columns)
     cells = row * world.columns + column
-    modes = world.kernel.shape[0] // world.num_cells
-    states = (cells[:, None] * modes + np.arange(modes)).ravel()
+    states = (cells[:, None] * world.modes + np.arange(world.modes)).ravel()
     kernel = world.kernel[states][:, states].toarray()
     kernel *= 0.99 / np.maximum(kernel.sum(axis=1, keepdims=True), 0.99)
     given = world.given | {

@@ -18,8 +18,7 @@ _SETTLED = 1e-14
 
 def cell_of_state(world: World) -> Indices:
     """`[Z]` the cell of each state of the kernel."""
-    states = world.kernel.shape[0]
-    return np.arange(states) // (states // world.num_cells)
+    return np.arange(world.num_states) // world.modes
 
 
 def by_cells(world: World, value: Array) -> Array:

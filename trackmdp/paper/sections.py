@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from trackmdp.paper import calibration
-from trackmdp.paper.calibration import DRAWS, Candidate, Openings, Setting, chosen
+from trackmdp.paper.calibration import DRAWS, Candidate, Openings, Setting, Spread, chosen
 from trackmdp.paper.check import NO_CASE, Check
 from trackmdp.paper.worlds import COSTS, PRINTED_QMDP, PRINTED_TMDP, SUPPORTS, Pairs, pairs
 from trackmdp.reports.grouping import Study
@@ -83,15 +83,10 @@ def sensitivity_table(settings: Sequence[Setting]) -> Table:
     """Median and range over draws of three figures, for every setting and pair."""
     columns = [Column("border"), Column("T_max"), Column("Z"), Column("c", 2)]
     for label, digits in (("Q_MDP accuracy %", 2), ("Q_MDP AIHTR", 1), ("clocked bound AIHTR", 1)):
-        columns += _spread_columns(digits, f"{label}, ")
+        columns += [Column(f"{label}, {part}", digits) for part in Spread._fields]
     rows = [[*s[:4], *s.accuracy, *s.qmdp, *s.clocked] for s in settings]
     caption = f"Median and range over {len(DRAWS)} draws of the kernel, by setting and pair"
     return Table("sensitivity", caption, columns, rows)
-
-
-def _spread_columns(digits: int, head: str = "") -> list[Column]:
-    """Columns of a `Spread`."""
-    return [Column(f"{head}{part}", digits) for part in ("median", "low", "high")]
 
 
 def sensitivity_figures(settings: Sequence[Setting]) -> list[Figure]:
@@ -140,7 +135,8 @@ def _ranges(name: str, label: str, settings: Sequence[Setting]) -> Figure:
     under = f"under the paper's unstated settings, c = {COSTS[0]:g}"
     dotted = "; dotted: the printed values" if printed else ""
     title = f"{label} {under}: median and range, n = {len(DRAWS)} draws{dotted}"
-    columns = [*map(Column, ("border", "T_max", "Z")), *_spread_columns(2)]
+    columns = [*map(Column, ("border", "T_max", "Z"))]
+    columns += [Column(part, 2) for part in Spread._fields]
     numbers: Rows = [[*s[:3], *getattr(s, name)] for s in settings]
     table = Table(f"sensitivity-{name}", title, columns, numbers)
     return draw_figure(table, 4.2, paint)

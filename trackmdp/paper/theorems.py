@@ -48,9 +48,8 @@ def check_theorems(world: World, solution: Solution, tolerance: float) -> Iterat
     near = (world, solution)
     if world.num_cells > MOST_CELLS:
         near = (corner(world), optimum.solve(corner(world), tolerance=SLACK))
-    for row in _track_property(*near):
-        yield row.judged(scale, closed=near[1].certified)
     for row in (
+        *_track_property(*near),
         *_tower_lemma(world),
         *_as_pomdp(world),
         *_estimator(*near),
@@ -58,10 +57,9 @@ def check_theorems(world: World, solution: Solution, tolerance: float) -> Iterat
         *proofs.of_values(corner(world)),
         *proofs.of_bounds(corner(world)),
         *proofs.of_searches(),
+        *_order(world, solution),
     ):
         yield row.judged(scale)
-    for row in _order(world, solution):
-        yield row.judged(scale, closed=solution.certified)
 
 
 def check_modes(world: World, solution: Solution, tolerance: float) -> Iterator[Check]:
@@ -98,8 +96,8 @@ def _largest(world: World, solution: Solution) -> float:
 
 def check_remarks(tolerance: float) -> Iterator[Check]:
     """Both remarks, each with its figures."""
-    yield _support().judged(tolerance)
-    yield _printed_bound().judged(tolerance)
+    for row in (_support(), _printed_bound()):
+        yield row.judged(tolerance)
 
 
 def info_states(world: World, policy: PolicyTable) -> Iterator[tuple[Array, BoolArray, BoolArray]]:
@@ -141,8 +139,8 @@ def _track_property(world: World, solution: Solution) -> Iterator[Check]:
     )
     needs = _needs(world)
     for (name, statement), deviation in zip(statements, largest.tolist(), strict=True):
-        note = needs or f"{states} info states"
-        row = Check(name, statement, deviation, expected=not needs, note=note)
+        note, closed = needs or f"{states} info states", solution.certified
+        row = Check(name, statement, deviation, expected=not needs, note=note, closed=closed)
         yield row.of_cases(due)
 
 
@@ -285,11 +283,13 @@ def _order(world: World, solution: Solution) -> Iterator[Check]:
         ("optimum <= clocked bound", solution.value, upper, f"{upper.mean():.6f}"),
         ("clocked bound <= valid bound", upper, valid, f"{valid.mean():.6f}"),
     )
+    closed = solution.certified
     for statement, low, high, note in rows:
-        yield Check("order", statement, float((low - high).max()), note=note)
+        yield Check("order", statement, float((low - high).max()), note=note, closed=closed)
     statement = "optimum <= the printed bound (it charges sensors on the exit step)"
     excess = float((solution.value - printed).max())
-    yield Check("order", statement, excess, expected=False, note=f"{printed.mean():.6f}")
+    note = f"{printed.mean():.6f}"
+    yield Check("order", statement, excess, expected=False, note=note, closed=closed)
 
 
 def _support() -> Check:

@@ -111,10 +111,7 @@ def table_of(
     kept = kept[once].copy()
     pieces = kept[["track", "piece"]]
     kept["piece"] = pieces.ne(pieces.shift()).any(axis=1).cumsum() - 1
-    kinds = dict.fromkeys(("track", "piece"), np.int64) | dict.fromkeys(
-        ("time", "x", "y"), np.float64
-    )
-    columns = {name: kept[name].to_numpy(kind) for name, kind in kinds.items()}
+    columns = {name: kept[name].to_numpy() for name in ("track", "piece", "time", "x", "y")}
     return Positions(**columns, **are, dropped={**(dropped or {}), **counts})
 
 
@@ -204,28 +201,26 @@ def _chosen_columns(names: Iterable[str], own: Sequence[str]) -> dict[str, str]:
     Raises:
         ValueError: one is missing or there twice, or there are both x, y and lon, lat.
     """
-    lowered = [(name.strip().lower(), name) for name in names]
-    known = dict(lowered)
+    lowered = [name.strip().lower() for name in names]
+    known = dict(zip(lowered, names, strict=True))
     usual = ALIASES | {
         name: (column.lower(),) for name, _, column in (each.partition(":") for each in own)
     }
-    found = {
-        name: next((known[each] for each in columns if each in known), None)
-        for name, columns in usual.items()
-    }
-    pairs = [pair for pair in (("x", "y"), ("lon", "lat")) if all(found[name] for name in pair)]
+    there = ((ours, each) for ours in usual for each in reversed(usual[ours]) if each in known)
+    found = {name: known[each] for name, each in there}  # the first one is the last set
+    pairs = [pair for pair in (("x", "y"), ("lon", "lat")) if found.keys() >= {*pair}]
     named = {each.partition(":")[0] for each in own}
     pairs = [pair for pair in pairs if named & {*pair}] or pairs  # a file may have both
     missing = [
-        f"{name} ({', '.join(usual[name][:3])})" for name in ("id", "time") if not found[name]
+        f"{name} ({', '.join(usual[name][:3])})" for name in ("id", "time") if name not in found
     ]
     if missing or len(pairs) != 1:
         wanted = [*missing, *(["either x, y or lat, lon"] if len(pairs) != 1 else [])]
         hint = "" if own else ", or kernel.columns=[id:NAME,...]"
         raise ValueError(f"columns {', '.join(known)[:80]}: expected {' and '.join(wanted)}{hint}")
-    chosen = {name: str(found[name]) for name in ("id", "time", *pairs[0])}
+    chosen = {name: found[name] for name in ("id", "time", *pairs[0])}
     for name in chosen.values():
-        if sum(name.strip().lower() == other for other, _ in lowered) > 1:
+        if lowered.count(name.strip().lower()) > 1:
             raise ValueError(f"two columns called {name.strip()}, in small letters or capitals")
     return chosen
 
@@ -301,7 +296,15 @@ def geojson(stream: BinaryIO) -> Positions:
     content = parse_json(stream.read(), "its content")
     features = content["features"] if content["type"] == "FeatureCollection" else [content]
     rows = [row for number, feature in enumerate(features) for row in _feature(feature, number)]
-    return table_of(*_columns(rows, 5), geographic=True)
+    return _of_rows(rows, geographic=True)
+
+
+def _of_rows(rows: Sequence[tuple[Any, ...]], **are: Any) -> Positions:
+    """`Positions` of rows id, time, x, y, piece; see `table_of`."""
+    import pandas as pd
+
+    frame = pd.DataFrame(rows, columns=("id", "time", "x", "y", "piece"))
+    return table_of(*(frame[name] for name in frame), **are)
 
 
 def _feature(feature: Mapping[str, Any], number: int) -> Iterator[tuple[Any, ...]]:
@@ -348,7 +351,7 @@ def gpx(stream: BinaryIO) -> Positions:
         for piece, segment in enumerate(track.segments)
         for point in segment.points
     ]
-    return table_of(*_columns(rows, 5), geographic=True)
+    return _of_rows(rows, geographic=True)
 
 
 def mot(stream: BinaryIO) -> Positions:
@@ -377,7 +380,8 @@ def sumo(stream: BinaryIO) -> Positions:
     from defusedxml.ElementTree import iterparse
 
     rows: list[tuple[Any, ...]] = []
-    time, root = None, None
+    time: Any = None
+    root = None
     # Not in pieces of 16 KiB, as iterparse asks for: expat before 2.6 looks through an unfinished value anew with each.
     pieces = SimpleNamespace(read=lambda _: stream.read(2**22))
     for event, element in iterparse(pieces, events=("start", "end"), forbid_dtd=True):
@@ -388,13 +392,8 @@ def sumo(stream: BinaryIO) -> Positions:
         if event == "start":
             time = element.attrib["time"] if element.tag == "timestep" else time
         elif element.tag in ("vehicle", "person"):
-            rows.append((element.attrib["id"], time, element.attrib["x"], element.attrib["y"]))
+            own = element.attrib
+            rows.append((own["id"], float(time), own["x"], own["y"], 0))
         elif element.tag == "timestep":
             root.clear()  # finished elements are let go: files of gigabytes are usual
-    own, times, x, y = _columns(rows, 4)
-    return table_of(own, [float(each) for each in times], x, y)
-
-
-def _columns(rows: Sequence[tuple[Any, ...]], count: int) -> list[list[Any]]:
-    """The columns of rows; empty ones where there are no rows."""
-    return [[row[place] for row in rows] for place in range(count)]
+    return _of_rows(rows)

@@ -53,35 +53,34 @@ _READERS: dict[str, tuple[Sequence[str], str, Sequence[str], Reader]] = {
 _FORMATS = {".npz": "cells"} | {end: kind for kind, (ends, *_) in _READERS.items() for end in ends}
 
 
-def read_positions(path: str | Path, kind: str, columns: Sequence[str] = ()) -> Positions:
-    """The positions in a file.
+def _source(path: Any) -> str:
+    """The name of a file, or of a DataFrame, in messages."""
+    return f"kernel.path={path}" if isinstance(path, str | Path) else "load_tracks"
+
+
+def read_positions(path: Any, kind: str, columns: Sequence[str] = ()) -> Positions:
+    """The positions in a file, or in a DataFrame of pandas.
 
     Args:
-        path: the file; it may be a link, since the user named it.
+        path: the file; it may be a link, since the user named it. Or the DataFrame.
         kind: one of the choices of `kernel.format` but `cells`.
         columns: names of the columns of a table (`kernel.columns`).
 
     Raises:
-        UserError: there is no such file, it is too large, not of that form, or without reports.
+        UserError: there is no such file, it is too large, not of that form, or without reports, and why.
     """
-    source = f"kernel.path={path}"
-    _, words, needed, reader = _READERS[kind]
-    for module in needed:
-        require(module, "tracks", source)
-    with (
-        opened(Path(path), most=LONGEST, source=source, links=True) as stream,
-        decoded(source, words),
-    ):
-        found = reader(stream, columns) if columns else reader(stream)
-    return _some(found, source, words)
-
-
-def _some(found: Positions, source: str, words: str) -> Positions:
-    """Positions, if there are any.
-
-    Raises:
-        UserError: there are none; the message says why reports were left out.
-    """
+    source, (_, words, needed, reader) = _source(path), _READERS[kind]
+    if isinstance(path, str | Path):
+        for module in needed:
+            require(module, "tracks", source)
+        with (
+            opened(Path(path), most=LONGEST, source=source, links=True) as stream,
+            decoded(source, words),
+        ):
+            found = reader(stream, columns) if columns else reader(stream)
+    else:
+        with decoded(source, words):
+            found = frame_positions(path, columns)
     if len(found.time):
         return found
     left = [f"{count} {why}" for why, count in found.dropped.items() if count]
@@ -120,7 +119,7 @@ def read_track_file(
     own = {name: value for name, value in given.items() if value is not None}
     columns = tuple(own.pop("columns", ()))
     in_memory = not isinstance(path, str | Path)
-    source = "load_tracks" if in_memory else f"kernel.path={path}"
+    source = _source(path)
     kind = "points" if in_memory or columns else format or _format_of(path)
     if format not in (None, kind):
         table = "a DataFrame" if in_memory else f"kernel.columns={list(columns)}"
@@ -143,11 +142,8 @@ def read_track_file(
     made = Gridding(
         size=size, shortest=shortest, exits=exits, **({"max_gap": _GAP * own["step"]} | own)
     )
-    if in_memory:
-        with decoded(source, "a table of positions"):
-            positions = _some(frame_positions(path, columns), source, "a table of positions")
-        return _on_grid(positions, made, source, draw)
-    return once(_read_on_grid, path, kind, made, columns, draw)
+    given_as = path, kind, columns, made, draw
+    return _on_grid(*given_as) if in_memory else once(_on_grid, *given_as)
 
 
 def _place_of_cells(own: Mapping[str, Any], source: str) -> Place | None:
@@ -166,21 +162,15 @@ def _place_of_cells(own: Mapping[str, Any], source: str) -> Place | None:
     return place
 
 
-def _read_on_grid(
-    path: str | Path, kind: str, grid: Gridding, columns: Sequence[str], draw: Draw
-) -> tuple[Parts, Mapping[str, int], Place]:
-    """See `read_track_file`."""
-    return _on_grid(read_positions(path, kind, columns), grid, f"kernel.path={path}", draw)
-
-
 def _on_grid(
-    positions: Positions, grid: Gridding, source: str, draw: Draw
+    path: Any, kind: str, columns: Sequence[str], grid: Gridding, draw: Draw
 ) -> tuple[Parts, Mapping[str, int], Place]:
     """See `read_track_file`."""
+    positions = read_positions(path, kind, columns)
     # Drawn first: what is held out must not move the grid, nor change the draw by leaving it.
     names = np.unique(positions.track)
     held_out, _ = draw_names(names, *draw)
-    tracks, loaded, place = to_tracks(positions, grid, source, held_out)
+    tracks, loaded, place = to_tracks(positions, grid, _source(path), held_out)
     return split(tracks, *draw, names=names), loaded, place
 
 

@@ -152,8 +152,8 @@ class Recorded(Task):
         **of_task: Unpack[TaskOptions],
     ) -> None:
         super().__init__(size, **of_task)  # type: ignore[arg-type]  # as in `World`
-        parts = {"tracks": tracks, "validation": validation, "held_out": held_out}
-        own: dict[str, object] = {**parts, "anywhere": anywhere, "loaded": loaded or {}}
+        own: dict[str, object] = {"tracks": tracks, "validation": validation, "held_out": held_out}
+        own |= {"anywhere": anywhere, "loaded": loaded or {}}
         for name, value in own.items():
             object.__setattr__(self, name, value)  # the dataclass is frozen
 

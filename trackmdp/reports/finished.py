@@ -54,12 +54,12 @@ def read_run(place: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]]:
 def _figures(summary: Mapping[str, Any]) -> dict[str, Any]:
     """`FIGURES` of a summary, of all targets together, and `HELD_OUT` where there are validation tracks."""
     if several := summary.get("several"):
-        found = {**summary, **_together(several["figures"]), **several}
         # Known to be attained: proved, or simulated of the merged optimum.
-        merged = _together(several["merged_optimum"] or {}).get("aihtr")
+        merged = _together(several["merged_optimum"]).get("aihtr")
         known = [value for value in (several["lower"], merged) if value is not None]
         ends = {"optimal_lower": max(known, default=None), "optimal_upper": several["upper"]}
-        return {name: found.get(name) for name in FIGURES} | ends
+        found = {**summary, **_together(several["figures"]), **several, **ends}
+        return {name: found.get(name) for name in FIGURES}
     validation, policy = summary.get("validation"), summary["policy"]
     solved = {f"optimal_{key}": value for key, value in (summary["optimal"] or {}).items()}
     # On recordings figures are compared, and options chosen, by the validation tracks alone.
@@ -72,7 +72,7 @@ def _references(summary: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Figures of other policies and bounds in the same world; on recordings those on the held-out tracks."""
     if several := summary.get("several"):
         # Q_MDP and fixed sets are of a single target.
-        policies = {"best known": _together(several["merged_optimum"] or {})}
+        policies = {"best known": _together(several["merged_optimum"])}
         alone = {"separate trackers": several["apart"], "clocked bound": several["upper"]}
     elif held_out := summary.get("held_out"):
         return {
@@ -91,9 +91,10 @@ def _references(summary: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     return found | {name: {"aihtr": value} for name, value in alone.items() if value is not None}
 
 
-def _together(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Means of figures of several targets."""
-    return {name: each["mean"] for name, each in figures.items() if name in _TRACKED.values()}
+def _together(figures: Mapping[str, Mapping[str, Any]] | None) -> dict[str, Any]:
+    """Means of figures of several targets; none of None."""
+    known = figures or {}
+    return {name: known[name]["mean"] for name in _TRACKED.values() if name in known}
 
 
 def read_curve(place: Path, summary: Mapping[str, Any]) -> Sequence[Sequence[float]]:

@@ -16,7 +16,7 @@ from trackmdp.errors import UserError
 from trackmdp.reports.finished import read_map, read_run
 from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.results import Anomaly, FinishedRun, Mapped, Results
-from trackmdp.training.folders import DONE, FAILED_FILE, PLAN, PLAN_BYTES, SUMMARY, run_of
+from trackmdp.training.folders import FAILED_FILE, PLAN, PLAN_BYTES, SUMMARY, run_of
 from trackmdp.untrusted import decoded, known_object, printable
 
 DRAWN = 2
@@ -94,19 +94,19 @@ def _read(place: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]]:
     Raises:
         UserError: the run failed, is not finished, or cannot be read.
     """
-    # With a summary it was ended by hand since.
-    if (place / FAILED_FILE).is_file() and not (place / SUMMARY).is_file():
+    # The summary is written last: without it the figures are not final.
+    if (place / SUMMARY).is_file():
+        return read_run(place, name)
+    if (place / FAILED_FILE).is_file():
         reason = known_object(place / FAILED_FILE).get("reason", "no reason given")
         raise UserError(f"failed: {reason}")
-    if not (place / "config.yaml").is_file():
-        # Other commands leave files of their own.
-        begun = (place / DONE).is_file()
-        raise UserError("done, but not by train" if begun else "not started")
-    # The summary is written last: without it the figures are not final.
-    if not (place / SUMMARY).is_file():
-        running = run_of(place).state == "running"
-        raise UserError("still running" if running else f"cut: it has no {SUMMARY}")
-    return read_run(place, name)
+    reasons = {
+        "waiting": "not started",
+        "running": "still running",
+        "cut": f"cut: it has no {SUMMARY}",
+        "done": "done, but not by train",  # other commands leave files of their own
+    }
+    raise UserError(reasons[run_of(place).state])
 
 
 def _anomaly(folder: Path, name: str, error: UserError) -> Anomaly:

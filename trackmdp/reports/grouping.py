@@ -54,16 +54,6 @@ class Study:
         pairs = product([world] if world else self.worlds, [method] if method else self.methods)
         return [run for pair in pairs for run in self.groups.get(pair, ())]
 
-    @property
-    def recorded(self) -> bool:
-        """Whether some runs learned from recordings."""
-        return any("held_out_aihtr" in run.figures for run in self.of())
-
-    @property
-    def several(self) -> bool:
-        """Whether some runs are of several targets."""
-        return any(run.settings.get("targets.count", 1) != 1 for run in self.of())
-
     def references(self) -> list[str]:
         """Names of the policies and bounds that runs are compared with."""
         return [*dict.fromkeys(name for run in self.of() for name in run.references)]

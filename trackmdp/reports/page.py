@@ -5,15 +5,16 @@ from __future__ import annotations
 import html
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, TypeAlias
 
 from trackmdp.notebook.card import counted_words
-from trackmdp.reports import figures, idea, maps, summaries, tradeoffs
+from trackmdp.reports import figures, idea, maps, tradeoffs
 from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.results import Mapped, Results
 from trackmdp.reports.style import Figure, Say
+from trackmdp.reports.summaries import groups_table, outcome_table, runs_table, shortened
 from trackmdp.reports.tables import Column, Table, paragraphs
 from trackmdp.untrusted import printable
 
@@ -95,29 +96,24 @@ def build(
     caption = "Runs that are missing or differ from the others"
     lost = [[anomaly.run, anomaly.text] for anomaly in results.anomalies]
     table = Table("missing", caption, [Column("run"), Column("reason")], lost)
-    missing = [Section("missing", "Missing runs", [table])]
+    missing = Section("missing", "Missing runs", [table] if lost else [])
     if not results.runs:
-        return Report(_about(results), missing)
+        return Report(_about(results), [missing])
     say("figures")
     grouped = study(results.runs)
     sections = [
         Section("outcome", "Outcome", _outcome(grouped, threshold)),
-        *(missing if results.anomalies else []),
-        *_section("idea", "Why few sensors are enough", _story(results.maps)),
-        *_section("prices", "Against the price of a sensor", _prices(grouped, threshold)),
-        *_section("learning", "Learning", _learning(grouped, threshold)),
-        *_section("maps", "Policies, cell by cell", _maps(results.maps)),
+        missing,
+        Section("idea", "Why few sensors are enough", _story(results.maps)),
+        Section("prices", "Against the price of a sensor", _prices(grouped, threshold)),
+        Section("learning", "Learning", _learning(grouped, threshold)),
+        Section("maps", "Policies, cell by cell", _maps(results.maps)),
         *extra,
-        Section("runs", "All runs", _runs(grouped, threshold)),
+        Section("runs", "All runs", [groups_table(grouped, threshold), runs_table(grouped)]),
         Section("words", "Words", [_facts(paragraphs("trackmdp.reports", "words.txt"))]),
         Section("made", "How it was made", [_facts(_made(results.manifest))]),
     ]
-    return Report(_about(results), sections)
-
-
-def _section(anchor: str, heading: str, parts: Sequence[Part]) -> list[Section]:
-    """A section, unless it is empty."""
-    return [Section(anchor, heading, parts)] if parts else []
+    return Report(_about(results), [each for each in sections if each.parts])
 
 
 def _part(part: Part) -> str:
@@ -152,9 +148,9 @@ def _about(results: Results) -> str:
 
 def _outcome(grouped: Study, threshold: float | None) -> list[Part]:
     # Beside the first table: a method that was stopped early is easily taken for a weak one.
-    short = "; ".join(summaries.shortened(grouped))
+    short = "; ".join(shortened(grouped))
     note = f"Fewer env steps than by default: {short}."
-    return [summaries.outcome_table(grouped, threshold), *([_paragraph(note)] if short else [])]
+    return [outcome_table(grouped, threshold), *([_paragraph(note)] if short else [])]
 
 
 def _story(drawn: Sequence[Mapped]) -> list[Part]:
@@ -195,11 +191,6 @@ def _maps(drawn: Sequence[Mapped]) -> list[Part]:
     sets = [maps.policy_map(figures.slug(f"{each.method}, {each.world}"), each) for each in drawn]
     large = any(len(each.value) > maps.MOST_MAP_CELLS for each in drawn)
     return [_prose("missing"), values, "" if large else _prose("sets"), sets]
-
-
-def _runs(grouped: Study, threshold: float | None) -> list[Part]:
-    by_group, every = summaries.groups_table(grouped, threshold), summaries.runs_table(grouped)
-    return [replace(by_group, folded="By world and method"), replace(every, folded="Every run")]
 
 
 def _made(manifest: Mapping[str, Any]) -> dict[str, str]:

@@ -75,9 +75,10 @@ def _note(study: Study) -> str:
     note += (
         f"; regrets may be too large where the optimum is not certified: {listed}" if wide else ""
     )
-    if study.several:
+    if any(run.settings.get("targets.count", 1) != 1 for run in study.of()):
         note += "; several targets: of all together, the best known being single optima merged"
-    return note + ("; on recordings, AIHTR of the validation tracks" if study.recorded else "")
+    tracks = any("held_out_aihtr" in run.figures for run in study.of())
+    return note + ("; on recordings, AIHTR of the validation tracks" if tracks else "")
 
 
 def shortened(study: Study) -> list[str]:
@@ -108,7 +109,8 @@ def groups_table(study: Study, threshold: float | None) -> Table:
     caption = (
         "Every world and method: means over n seeds, with intervals of the AIHTR and of the regret"
     )
-    return Table("groups", caption, [*columns, *_within_column(threshold), Column("n")], rows)
+    columns += [*_within_column(threshold), Column("n")]
+    return Table("groups", caption, columns, rows, folded="By world and method")
 
 
 def runs_table(study: Study) -> Table:
@@ -121,7 +123,8 @@ def runs_table(study: Study) -> Table:
             rows.append([world, method, run.seed, *cells, *study.ends(world), best, run.name])
     columns = [Column("world"), Column("method"), Column("seed"), *FIGURES.values(), *OPEN_ENDS]
     columns += [Column("regret per step to the best known", 5), Column("folder")]
-    return Table("runs", f"All {len(rows)} finished runs", columns, rows)
+    caption = f"All {len(rows)} finished runs"
+    return Table("runs", caption, columns, rows, folded="Every run")
 
 
 def _within_column(threshold: float | None) -> list[Column]:

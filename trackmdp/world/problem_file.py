@@ -26,7 +26,7 @@ from scipy import sparse
 from trackmdp.arrays.files import csr_of, npz_bytes
 from trackmdp.arrays.types import AnyArray, IndexArray, Indices
 from trackmdp.errors import UserError
-from trackmdp.grid.place import Place, place_arrays, place_in
+from trackmdp.grid.place import Place
 from trackmdp.recordings.tracks import Recorded, Tracks
 from trackmdp.sensing.coverage import Coverage
 from trackmdp.untrusted import LARGE, decoded, load_npz, opened
@@ -131,11 +131,12 @@ def _parts(value: Any) -> Mapping[str, Any] | None:
             "shape": matrix.shape,
         }
     if isinstance(value, Tracks):
-        parts = {name: getattr(value, name) for name in sorted(_TRACKS)}
-        return {name: part for name, part in parts.items() if part is not None}
-    if isinstance(value, Place):
-        return place_arrays(value)
-    return value if isinstance(value, Mapping) else None
+        value = {name: getattr(value, name) for name in sorted(_TRACKS)}
+    elif isinstance(value, Place):
+        value = value.facts()
+    if not isinstance(value, Mapping):
+        return None
+    return {name: part for name, part in value.items() if part is not None}
 
 
 def from_arrays(arrays: Mapping[str, AnyArray]) -> dict[str, Any]:
@@ -163,7 +164,7 @@ def _whole(parts: Arrays) -> Any:
     if parts.keys() | {"begins"} == _TRACKS:
         return Tracks(**parts)
     if "corner" in parts:
-        return place_in(parts)
+        return Place(**{name: array.tolist() for name, array in parts.items()})
     return {name: int(part) for name, part in parts.items()}
 
 

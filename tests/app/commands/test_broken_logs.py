@@ -19,7 +19,7 @@ from trackmdp.episodes import schema
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.reader import EpisodeReader
-from trackmdp.episodes.schema import TABLES, LoggedRun
+from trackmdp.episodes.schema import TABLES
 from trackmdp.episodes.writer import EpisodeWriter
 
 __all__ = ["log"]
@@ -31,7 +31,7 @@ def changed(
     """The log with episode 4 changed, all checksums right."""
     with EpisodeReader(log) as reader:
         tables = {name: reader.attachment(name) for name in TABLES}
-        writer = EpisodeWriter(target, LoggedRun(target, reader.run.said | (run or {})), tables)
+        writer = EpisodeWriter(target, reader.said | (run or {}), tables)
         facts = {key: value for key, value in reader.policies[0].items() if key != "table.sha256"}
         writer.copy_policy(facts, reader.policy_tables(0))
         for episode in reader.episodes():

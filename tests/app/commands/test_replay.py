@@ -62,7 +62,7 @@ def replay(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, s
 def test_evaluate_logs_as_many_episodes_as_it_simulates(log: Path) -> None:
     with EpisodeReader(log) as reader:
         assert len(reader) == 30
-        assert reader.run.said["seed"] == "3"
+        assert reader.said["seed"] == "3"
         assert parse_yaml(reader.attachment("config.yaml"), "")["grid"]["size"] == 4
     layout = json.loads((log.parent / "episodes.layout.json").read_text())
     maps = [panel for panel in layout["configById"].values() if "topics" in panel]

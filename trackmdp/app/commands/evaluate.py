@@ -8,11 +8,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
 
+from trackmdp.app.commands.evaluate_false_alarms import evaluate_believed
+from trackmdp.app.commands.evaluate_playback import evaluate_playback
 from trackmdp.config import (
     EvaluateConfig,
     FalseAlarmConfig,
@@ -21,24 +22,18 @@ from trackmdp.config import (
     load_run_config,
     to_yaml,
 )
-from trackmdp.config.registry import make
 from trackmdp.durable import write_json, write_text
 from trackmdp.episodes.batch import Episodes
-from trackmdp.episodes.filtered import simulate_filter
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.player import draw_picture
-from trackmdp.episodes.reader import EpisodeReader
-from trackmdp.episodes.simulate import resimulate, simulate
+from trackmdp.episodes.simulate import simulate
 from trackmdp.episodes.simulated_figures import Simulation
-from trackmdp.errors import UserError
-from trackmdp.notebook.card import counted_words, grid_words
-from trackmdp.policies.acting import Playback
+from trackmdp.notebook.card import counted_words
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.recordings.gridding import said
 from trackmdp.recordings.tracks import Recorded
 from trackmdp.reports.held_out import recorded_page
-from trackmdp.solvers import bounds
 from trackmdp.solvers.evaluate import evaluate, group_rule
 from trackmdp.solvers.evaluation import figures
 from trackmdp.solvers.several.group_bounds import upper_bound
@@ -46,13 +41,13 @@ from trackmdp.solvers.several.group_figures import with_ends
 from trackmdp.solvers.several.group_value import evaluate_group
 from trackmdp.solvers.solve import baseline_policy
 from trackmdp.training.devices import make_device
-from trackmdp.training.display import FIGURES, make_console, show_held_out, table, with_interval
+from trackmdp.training.display import FIGURES, make_console, show_held_out, table
 from trackmdp.training.evaluator import CELL_ALONE, ExactEvaluator, HeldOutEvaluator
 from trackmdp.training.folders import SUMMARY, check_files, read_summary
 from trackmdp.training.run import trained
 from trackmdp.world.group import Group, Subject, group_of, one_target
 from trackmdp.world.model import World
-from trackmdp.world.problem import Problem, modelled
+from trackmdp.world.problem import Problem
 
 _FOR_THE_PICTURE = 16  # episodes simulated where none are asked for
 
@@ -257,99 +252,3 @@ def _compared(subject: str, report: dict[str, Any], simulation: Simulation | Non
         )
     title = f"{simulation.episodes} simulated ± s.e." if simulation else "simulated"
     return table(subject, ["figure", "exact", title, "Q_MDP exact"], rows)
-
-
-def evaluate_playback(
-    cfg: EvaluateConfig, chosen: PlaybackConfig, world: Problem, folder: Path, console: Console
-) -> float:
-    """Value the actions of a logged episode, on its own target and on others; returns the simulated AIHTR.
-
-    Such a policy ignores its observations, so that it has no table and no exact value.
-    """
-    with EpisodeReader(chosen.file) as reader:
-        if reader.run.size != world.size:
-            recorded = f"baseline.file={chosen.file}: recorded on {grid_words(reader.run.size)}"
-            raise UserError(f"{recorded}, expected grid.size of {grid_words(world.size)}")
-        if reader.run.kinds:
-            raise UserError(f"baseline.file={chosen.file}: of several targets, expected one")
-        logged = reader.read(chosen.episode)
-    actions = Playback(world, logged.action)
-    # The logged episode's own seed gives its own target again, so that both returns agree where nothing has changed
-    # since.
-    again = resimulate(world, actions, [logged.seed])[0]
-    simulation = simulate(world, actions, cfg.episodes, seed=cfg.seed).figures()
-    report = {
-        "policy": chosen.name,
-        "file": Path(chosen.file).name,
-        "episode": logged.number,
-        "logged_return": float(logged.returns[-1]),
-        "return": float(again.returns[-1]),
-        "simulated": asdict(simulation),
-    }
-    write_json(folder / "evaluation.json", report)
-    rows = [
-        ["logged", f"{report['logged_return']:,.4f}"],
-        ["again, on the same target", f"{report['return']:,.4f}"],
-        [
-            f"on {cfg.episodes} other targets",
-            f"{simulation.aihtr.mean:,.4f} ± {simulation.aihtr.standard_error:.4f}",
-        ],
-    ]
-    console.print(table(f"actions of episode {logged.number}", ["", "return"], rows))
-    console.print(f"results in {folder}")
-    return simulation.aihtr.mean
-
-
-def evaluate_believed(
-    cfg: EvaluateConfig, problem: Problem, policy: Policy, subject: str, folder: Path, at: Console
-) -> float:
-    """Evaluate where sensors report targets that are not there: the exact AIHTR, each report taken for the truth.
-
-    Raises:
-        UserError: tracks instead of a world, or a refusal of `trackmdp.solvers.false_alarms.believed`.
-    """
-    sensor = cfg.sensor
-    assert isinstance(sensor, FalseAlarmConfig)
-    # A trained policy's world is its run's, with the sensors asked for.
-    sensors = make(sensor, problem.size)
-    world = modelled(problem, "sensor=false_alarm").but(safe_detection=1.0, **sensors)
-    silent, alarmed = evaluate(world, policy), evaluate(world, policy, false_alarm=sensor.p_f)
-    # A window is about the last located cell, and the filter is never sure of one.
-    wanted = cfg.episodes if world.window is None else 0
-    filtered = _filtered(world, sensor.p_f, wanted, cfg.seed, alarmed.expected_length)
-    # Not the clocked bound: a report that is wrong sets the clock back, and D is paid later.
-    bound = float(bounds.valid(world).mean())
-    loss = (silent.aihtr - alarmed.aihtr) / alarmed.expected_length
-    noisy, plain = figures(alarmed), figures(silent)
-    report = {
-        "policy": subject,
-        "p_f": sensor.p_f,
-        "exact": noisy,
-        "without_false_alarms": plain,
-        "filter": filtered if wanted else None,
-        "bounds": {"valid": bound},
-        "loss_per_step": loss,
-    }
-    write_json(folder / "evaluation.json", report)
-    rows = []
-    for key in ("aihtr", "accuracy", "sensors_per_step"):
-        played = with_interval(filtered[key], 4) if wanted else ""
-        rows.append([FIGURES[key], f"{noisy[key]:,.4f}", f"{plain[key]:,.4f}", played])
-    played = f"Bayes filter, {wanted} episodes, 95 %"
-    heads = ["figure", f"p_f = {sensor.p_f:g}, exact", "p_f = 0", played]
-    at.print(table(f"{subject}, each report taken for the truth", heads, rows))
-    lost = f"{loss:.4f} a step lost to false alarms"
-    at.print(f"upper bound (valid, of p_f = 0) {bound:,.4f}; {lost}; results in {folder}")
-    return alarmed.aihtr
-
-
-def _filtered(
-    world: World, p_f: float, episodes: int, seed: int, steps: float
-) -> dict[str, dict[str, Any]]:
-    """Figures of a tracker with the exact belief, with intervals; `steps` is the exact length of an episode."""
-    simulated = simulate_filter(world, p_f, episodes, seed=seed).intervals(np.arange(episodes))
-    found = {key: asdict(each) for key, each in simulated.items()}
-    # The length of a stay is known exactly, and the same for all policies: most of the variance of returns.
-    rate = found["reward_per_step"]
-    found["aihtr"] |= {end: rate[end] and steps * rate[end] for end in ("mean", "low", "high")}
-    return found

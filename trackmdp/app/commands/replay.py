@@ -35,7 +35,7 @@ def run(cfg: ReplayConfig, folder: Path) -> None:  # noqa: ARG001  every file ha
             console.print(f"lost: {line}")
     with EpisodeReader(file) as reader:
         # First: other versions of NumPy or torch may draw other numbers, which is not damage.
-        if apart := versions_apart(reader.run.said):
+        if apart := versions_apart(reader.said):
             console.print(f"made by other versions: {apart}")
         asked = _exports(console, cfg, reader)
         if cfg.verify:
@@ -55,7 +55,7 @@ def _exports(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> bool
     writers: dict[str, Callable[[Path], object]] = {
         "html": lambda path: write_page(reader, path, cfg.episode),
         "csv": lambda path: write_tables(reader, path, cfg.episode),
-        "layout": lambda path: write_layout(path, reader.run),
+        "layout": lambda path: write_layout(path, reader.world()),
     }
     asked = {key: path for key in writers if (path := getattr(cfg, key)) is not None}
     for key, path in asked.items():
@@ -74,7 +74,7 @@ def _verify(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> None:
     with console.status("re-simulating"):
         verified = verify(reader, numbers=numbers)
     if verified.difference is not None:
-        apart = versions_apart(reader.run.said)
+        apart = versions_apart(reader.said)
         because = f"; made by other versions: {apart}" if apart else ""
         raise RunError(f"file={cfg.file}: {verified.difference}{because}")
     episodes = counted_words(verified.episodes, "episode")
@@ -85,11 +85,12 @@ def _verify(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> None:
 def _list(console: Console, reader: EpisodeReader) -> None:
     total = counted_words(sum(row["length"] for row in reader.rows), "step")
     episodes = counted_words(len(reader), "episode")
-    (rows, columns), seed = reader.run.size, reader.run.said.get("seed", "")
-    grid = f"{rows}x{columns} grid"
-    if reader.run.kinds:
-        grid += f" with {len(reader.run.kinds)} targets"
-    console.print(f"{episodes}, {total} on a {grid}, T_max {reader.run.t_max}, seed {seed}")
+    problem, seed = reader.world(), reader.said.get("seed", "")
+    task = problem.single
+    grid = f"{task.rows}x{task.columns} grid"
+    if problem.targets:
+        grid += f" with {len(problem.targets)} targets"
+    console.print(f"{episodes}, {total} on a {grid}, T_max {task.t_max}, seed {seed}")
     labels = [reader.policies[row["policy"]].get("label", "") for row in reader.rows]
     one = len(set(labels)) == 1
     if one:
