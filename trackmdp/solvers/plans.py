@@ -20,6 +20,7 @@ from scipy import sparse
 
 from trackmdp.arrays.entries import summing, with_data
 from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
+from trackmdp.policies.table import SetTable
 from trackmdp.sensing.decisions import Decisions
 
 
@@ -59,6 +60,23 @@ class Layout:
     def __init__(self, rows: IndexArray, turns: Sequence[Turn], count: int) -> None:
         self.turns, self.count = list(turns), count
         self.rows = [rows, *(turn.rows for turn in turns)]
+
+    def sets(self, policy: SetTable, plans: IndexArray) -> list[BoolArray]:
+        """`[G, 1]` for each free choice, the sets of a policy that does not draw; its `plans` `[K]` are the rows'."""
+        choices = (turn.choice for turn in self.turns)
+        return [
+            policy.chosen(n, plans[each.rows], each.sensors)[:, None] > 0
+            for n, each in enumerate(choices)
+        ]
+
+    def sensed(
+        self, sets: Sequence[BoolArray], plans: IndexArray
+    ) -> list[tuple[IndexArray, IndexArray]]:
+        """For each free choice the plans and their sensors on, by sets `[G, 1]`; `plans` `[K]` are the rows'."""
+        choices, some = (turn.choice for turn in self.turns), (np.flatnonzero(on) for on in sets)
+        return [
+            (plans[each.rows[on]], each.sensors[on]) for each, on in zip(choices, some, strict=True)
+        ]
 
     @cached_property
     def sums(self) -> list[sparse.csr_array]:

@@ -214,18 +214,11 @@ class Renewal:
 
     def sets(self, policy: PolicyTable) -> list[BoolArray]:
         """The sets of a deterministic policy; sensors where the target cannot be are left out."""
-        return [
-            policy.chosen(n, self.plans[choice.rows], choice.sensors)[:, None] > 0
-            for n, choice in enumerate(self.choices)
-        ]
+        return self.layout.sets(policy, self.plans)
 
     def table(self, sets: Sequence[BoolArray]) -> PolicyTable:
         """The policy of sets; a key that cannot occur has none."""
-        some = [np.flatnonzero(on) for on in sets]
-        parts = zip(self.choices, some, strict=True)
-        return PolicyTable.from_sensed(
-            self.task, [(self.plans[choice.rows[on]], choice.sensors[on]) for choice, on in parts]
-        )
+        return PolicyTable.from_sensed(self.task, self.layout.sensed(sets, self.plans))
 
 
 def check_room(task: Task, motion: Motion, events: Events) -> None:
