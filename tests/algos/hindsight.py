@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import torch
 from tensordict import TensorDict
 from torch import Tensor
 
 from tests.helpers import algorithm, collect, small_world
 from trackmdp.algos.actor_loss import ActorLoss, Decision, Poisson, PolicyGradient, Surrogate
+from trackmdp.algos.gains import Credit
 from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.config.learning import ScheduleConfig
 from trackmdp.policies.policy import as_policy
@@ -90,3 +92,20 @@ def total(loss: HindsightLoss, cells: Tensor, on: Tensor, blend: float) -> dict[
             name: losses[name] + each if name in losses else each for name, each in part.items()
         }
     return losses
+
+
+def chain_returns(
+    hits: Tensor,
+    inside: Tensor,
+    set_cost: Tensor,
+    value: Tensor,
+    *,
+    safe_cost: float,
+    discount: float,
+    safe: float = 1.0,
+    missed: float = 0.0,
+) -> Tensor:
+    """`Credit.returns`, a target that the safe action misses being worth `missed` in any cell."""
+    credit = Credit(discount, safe_cost, safe - safe_cost, torch.tensor([safe, 0.0]))
+    end = torch.zeros(value.shape[1], dtype=torch.int64)
+    return credit.returns(hits, inside, set_cost, value, end, torch.tensor([missed]))

@@ -6,15 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from trackmdp.algos.gains import chain_returns, clocked_advantage, sensing_gain
+from tests.algos.hindsight import chain_returns
+from trackmdp.algos.gains import Credit, clocked_advantage
 
 
-def test_sensing_gain_by_hand() -> None:
-    clocked, own = torch.tensor([4.0]), torch.tensor([2.0])
-    assert sensing_gain(clocked, discount=0.5).item() == 3.0
-    assert sensing_gain(clocked, own, discount=0.5, blend=0.0).item() == 3.0
-    assert sensing_gain(clocked, own, discount=0.5, blend=1.0).item() == 2.0
-    assert sensing_gain(clocked, own, discount=0.5, blend=0.25).item() == 2.75
+def test_the_gain_of_a_sensor_by_hand() -> None:
+    credit = Credit(0.5, 5.0, -4.0, torch.ones(2))
+    assert credit.gain(torch.tensor([4.0, 2.0])).tolist() == [3.0, 2.0]
 
 
 def test_clocked_advantage_compares_each_clock_with_a_detection() -> None:

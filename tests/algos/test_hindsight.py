@@ -16,8 +16,7 @@ from tests.algos.hindsight import (
     policy,
 )
 from tests.helpers import algorithm, small_world, train_config
-from trackmdp.algos.estimates.key_plans import KeyPlans, along
-from trackmdp.algos.estimates.path_gains import Paths
+from trackmdp.algos.estimates.path_gains import KeyPlans, Paths, along
 from trackmdp.algos.estimates.path_plans import choose_plan, parted
 from trackmdp.algos.hindsight import _within, budget
 from trackmdp.errors import UserError

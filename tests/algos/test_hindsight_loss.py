@@ -68,7 +68,7 @@ def written_out(
     loss: HindsightLoss, world: Task, cells: Tensor, on: Tensor, blend: float, form: str
 ) -> dict[str, Tensor]:
     """The losses one path, clock and sensor at a time, as the theory writes them (whole grid, no normalisation)."""
-    m, last, g = world.num_keys, world.num_choices, loss._plans.credit.discount
+    m, last, g = world.num_keys, world.num_choices, loss.credit.discount
     cost, safe = world.cost / world.reward, 1.0 - world.safe_cost / world.reward
     price = torch.as_tensor(cost, dtype=torch.float32)
     covers = torch.as_tensor(world.covered(np.eye(world.total_sensors, dtype=bool)))  # [S, cells]

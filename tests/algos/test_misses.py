@@ -10,12 +10,11 @@ import torch
 from scipy import sparse
 
 import trackmdp as tm
-from tests.algos.hindsight import SOLVES, batches, learn, policy, total
+from tests.algos.hindsight import SOLVES, batches, chain_returns, learn, policy, total
 from tests.helpers import algorithm, small_world
 from tests.tracks import drawn
 from trackmdp.algos.actor_loss import Decision
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
-from trackmdp.algos.gains import chain_returns
 from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.algos.moves import MoveBuffer, report_weights
 from trackmdp.algos.observed import observed_paths
@@ -105,7 +104,8 @@ def test_a_safe_action_that_misses_is_repeated() -> None:
         torch.tensor([[4.0], [2.0]]),
         safe_cost=5.0,
         discount=0.5,
-        repeated=(torch.tensor([0.25]), torch.tensor([-8.0])),
+        safe=0.25,
+        missed=-8.0,
     )
     assert found.flatten().tolist() == pytest.approx([0.5 * -7.5, -7.5])
 
@@ -127,7 +127,7 @@ def test_critics_settle_at_the_value_of_what_is_repeated(hidden: int) -> None:
         optimizer.step()
     # V = .9 · .8 L, and U is the same: nothing is worth 9.
     exact = np.linalg.solve([[1.0, -0.72], [-0.36, 1 - 0.36]], [0.0, 0.9 * (0.5 - 2)])
-    forced = torch.tensor([0.0, loss._forced])
+    forced = torch.tensor([0.0, loss.credit.forced])
     for net in (loss.critic, loss.clocked_critic):
         assert (net().flatten() + forced).tolist() == pytest.approx(exact.tolist(), abs=1e-3)
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from tests.helpers import headings
+from trackmdp.algos.gains import Credit
 from trackmdp.algos.path_replay import Replay
 from trackmdp.sensing.windows import Window
 
@@ -93,9 +96,11 @@ def test_it_is_followed_as_one_path_at_a_time(memory: str, t_max: int) -> None:
             for step, k in enumerate(own[1:])
         ]
         expected.append((own, after))
-    replay = Replay(world, Window(world, None), on, rng)
+    task = replace(world.task, safe_cost=(1.0 - SAFE) * world.reward)
+    credit = Credit.of(task, DISCOUNT, rng.device)
+    replay = Replay(replace(task, markov=False), Window(world, None), credit, on, spent, rng)
     begun, own = replay.begin(paths)
-    found = replay.worth(begun, own, spent, value, safe_cost=1.0 - SAFE, discount=DISCOUNT)
+    found = replay.worth(begun, own, value)
     assert own.T.tolist() == [each for each, _ in expected]
     assert len(expected) > 15
     torch.testing.assert_close(found.T, torch.tensor([each for _, each in expected]))

@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModule
 
 from tests.helpers import limited, small_world
 from tests.tracks import by_hand, recorded
-from trackmdp.environment import draws
+from trackmdp.environment import targets
 from trackmdp.environment.env import TrackEnv
 from trackmdp.motion.modes import heading_kernel
 from trackmdp.seeding import generator
@@ -123,7 +123,7 @@ def test_every_tensor_is_made_on_the_environments_device(name: str) -> None:
 def test_all_of_it_moves_to_another_device(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """To `meta`, which holds no data: tensors of two devices in one operation are an error there, as on a GPU."""
     # No generator lives there.
-    monkeypatch.setattr(draws, "generator", lambda seed, *names, device: generator(seed, *names))
+    monkeypatch.setattr(targets, "generator", lambda seed, *names, device: generator(seed, *names))
     env = pair(name)[0].to("meta")
     off = TensorDict({"action": env.action_spec.zero()}, env.batch_size)
     carried = env.step_and_maybe_reset(off.clone())[1]

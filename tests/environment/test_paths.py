@@ -12,8 +12,14 @@ from scipy import sparse, stats
 from tests.helpers import random_kernel
 from trackmdp.environment.paths import RESOLUTION, PathSampler
 from trackmdp.errors import UserError
+from trackmdp.motion.chain import Motion
 
 LARGEST = 1.0 - 1.0 / RESOLUTION
+
+
+def sampler_of(kernel: sparse.csr_array | np.ndarray) -> PathSampler:
+    """The sampler of a target whose states are the cells."""
+    return PathSampler(Motion.of(sparse.csr_array(kernel)), kernel.shape[0])
 
 
 def moved(sampler: PathSampler, cells: torch.Tensor, draws: object) -> torch.Tensor:
@@ -43,7 +49,7 @@ def kernels(draw: st.DrawFn) -> np.ndarray:
 def test_a_cell_of_probability_zero_is_never_reached(kernel: np.ndarray, seed: int) -> None:
     m = len(kernel)
     motion, possible = (
-        PathSampler(sparse.csr_array(kernel)),
+        sampler_of(kernel),
         np.append(kernel > 0, closed(kernel)[:, -1:] > 1e-15, axis=1),
     )
     edges = np.floor(np.cumsum(closed(kernel), axis=1) * 2**40)
@@ -61,7 +67,7 @@ def test_each_successor_has_its_own_stretch_of_draws(exit_probability: float) ->
     """Just below and just above every edge of every row: nowhere is the sampler off the table by more than 2^-37."""
     kernel = random_kernel(np.random.default_rng(0), 40, exit_probability)
     kernel = np.where(kernel > 1e-6, kernel, 0.0)
-    motion, table, step = PathSampler(sparse.csr_array(kernel)), closed(kernel), 2.0**-37
+    motion, table, step = sampler_of(kernel), closed(kernel), 2.0**-37
     for cell, row in enumerate(table):
         successors = np.flatnonzero(row > 1e-9)
         ends = np.cumsum(row)[successors]
@@ -76,7 +82,7 @@ def test_the_last_cells_of_a_large_grid_are_sampled_as_finely() -> None:
     m = 4096
     kernel = np.zeros((m, m))
     kernel[np.arange(m), np.arange(m)[::-1]] = 1 - 1e-6
-    motion, cells = PathSampler(sparse.csr_array(kernel)), torch.arange(m)
+    motion, cells = sampler_of(kernel), torch.arange(m)
     stays = moved(motion, cells, 1 - 1e-6 - 2.0**-38)
     leaves = moved(motion, cells, 1 - 1e-6 + 2.0**-38)
     assert torch.equal(stays, cells.flip(0))
@@ -94,7 +100,7 @@ def test_a_million_cells_are_sampled_as_finely() -> None:
         (np.repeat(cells, 2), np.sort([cells, cells ^ 1], axis=0).T.ravel()),
     )
     motion, some = (
-        PathSampler(sparse.csr_array(table, shape=(m, m))),
+        sampler_of(sparse.csr_array(table, shape=(m, m))),
         torch.tensor([0, 5, m // 2, m - 1]),
     )
     first, second = some & ~1, some | 1
@@ -109,14 +115,14 @@ def test_a_million_cells_are_sampled_as_finely() -> None:
 def test_more_cells_than_the_line_holds_are_refused() -> None:
     wide = (np.full(40, 0.02), (np.zeros(40, dtype=np.int64), np.arange(40)))
     with pytest.raises(UserError, match="8,388,607 states, expected at most 8,388,606"):
-        PathSampler(sparse.csr_array(wide, shape=(2**23 - 1, 2**23 - 1)))
+        sampler_of(sparse.csr_array(wide, shape=(2**23 - 1, 2**23 - 1)))
 
 
 def test_a_row_that_sums_to_a_little_more_than_one_stays_in_its_row() -> None:
     """Row sums up to 1 + 1e-9 are accepted; a last cell smaller than that excess must not shift the next row."""
     kernel = np.eye(9) * (1 + 9e-10)
     kernel[:8, 8] = 1e-12
-    motion, cells = PathSampler(sparse.csr_array(kernel)), torch.arange(9)
+    motion, cells = sampler_of(kernel), torch.arange(9)
     for draw in (0.0, 2.0**-40, 2.0**-31, 0.4):
         assert torch.equal(moved(motion, cells, draw), cells)
     last = moved(motion, cells, LARGEST)
@@ -124,13 +130,13 @@ def test_a_row_that_sums_to_a_little_more_than_one_stays_in_its_row() -> None:
 
 
 def test_an_exited_target_stays_away() -> None:
-    motion = PathSampler(sparse.csr_array(random_kernel(np.random.default_rng(1), 9, 0.1)))
+    motion = sampler_of(random_kernel(np.random.default_rng(1), 9, 0.1))
     draws = torch.tensor([0.0, 0.5, LARGEST], dtype=torch.float64)
     assert moved(motion, torch.full((3,), 9), draws).tolist() == [9, 9, 9]
 
 
 def test_draws_are_uniform_on_their_grid_and_the_generators_alone() -> None:
-    motion = PathSampler(sparse.csr_array(random_kernel(np.random.default_rng(1), 4, 0.1)))
+    motion = sampler_of(random_kernel(np.random.default_rng(1), 4, 0.1))
     draws = motion.draw(100_000, torch.Generator().manual_seed(5))
     torch.rand(3)
     assert torch.equal(draws, motion.draw(100_000, torch.Generator().manual_seed(5)))
@@ -143,7 +149,7 @@ def test_draws_are_uniform_on_their_grid_and_the_generators_alone() -> None:
 def test_frequencies_are_those_of_the_table() -> None:
     kernel = random_kernel(np.random.default_rng(2), 9, 0.05)
     motion, rng, count = (
-        PathSampler(sparse.csr_array(kernel)),
+        sampler_of(kernel),
         torch.Generator().manual_seed(0),
         100_000,
     )
@@ -165,10 +171,10 @@ def test_frequencies_are_those_of_the_table() -> None:
 def test_padded_rows_give_the_answers_of_one_line(kernel: np.ndarray, seed: int) -> None:
     """Short rows are padded, and searched one by one; long rows lie on one line, and so do all with _SHORT = -1."""
     m, table = len(kernel), sparse.csr_array(kernel)
-    padded = PathSampler(table)
+    padded = sampler_of(table)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("trackmdp.environment.paths._SHORT", -1)
-        line = PathSampler(table)
+        line = sampler_of(table)
     edges = np.floor(np.cumsum(closed(kernel), axis=1) * RESOLUTION)
     near = np.concatenate([edges + step for step in (-1, 0, 1)], axis=1)
     anywhere = np.random.default_rng(seed).integers(RESOLUTION, size=(m, 9))

@@ -82,7 +82,14 @@ class Hindsight(Checkpointed):
     output for where it is.
     """
 
-    parts: ClassVar[tuple[str, ...]] = ("_seed", "_iteration", "_update", "_buffer", "_generator")
+    parts: ClassVar[tuple[str, ...]] = (
+        "_seed",
+        "_iteration",
+        "_update",
+        "_buffer",
+        "_generator",
+        "_learner",
+    )
 
     def __init__(
         self, task: Task, cfg: PerSensorConfig, *, iterations: int, seed: int, device: torch.device
@@ -155,18 +162,12 @@ class Hindsight(Checkpointed):
             return self._buffer.sample(-(-self.cfg.batch_size // _LONGER))
         return self._buffer.paths(self.cfg.batch_size, self.task.t_max + 2)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Counters, generator, moves, and once they exist the nets with all that trains them."""
-        learner = self._learner
-        return super().state_dict() | {"learner": None if learner is None else learner.state_dict()}
-
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
         self._seen = self._learner = None
         if saved := state["learner"]:
             self._learner = self._make_learner(saved["reach"])
-            self._learner.load_state_dict(saved)
-        # After the learner, whose initial weights were drawn from the generator.
+        # After the learner is made, whose initial weights were drawn from the generator.
         super().load_state_dict(state)
         if self._learner is not None:
             self._renew_policy(self._learner)

@@ -40,6 +40,7 @@ class SensorsInView(nn.Module):
         window: C cells around each located cell.
 
     Attributes:
+        window: as given.
         numbers: `[M, K]` int64, the sensors; S, which there is none of, where a located cell has fewer than K.
         prices: `[M, K]` their prices, in units of r; 0 of S.
         width: K.
@@ -56,7 +57,7 @@ class SensorsInView(nn.Module):
 
     def __init__(self, task: Task, window: Window) -> None:
         super().__init__()
-        self.shared = task.coverage is not None
+        self.window, self.shared = window, task.coverage is not None
         self._perfect = task.perfect and (self.shared or bool(task.available.all()))
         device, classes = window.cells.device, task.keys.num_classes
         tables = _tables(task, window) if self.shared else _own(task, window)

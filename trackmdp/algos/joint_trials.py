@@ -19,7 +19,7 @@ from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.policies.table import PolicyTable
 from trackmdp.sensing.task import Task
 from trackmdp.solvers.exchange import exchange
-from trackmdp.solvers.plans import Plans
+from trackmdp.solvers.plans import Plans, sensed, sets_of
 
 _ROUNDS, _JUDGES, _SURE = 3, 10, 3.0
 """Rounds at most; batches of paths that judge; standard errors of its gain that a proposal has to exceed."""
@@ -62,10 +62,10 @@ class _Paths:
     """
 
     def __init__(self, task: Task, paths: IndexArray, discount: float) -> None:
-        self._task, self._count = task, task.num_keys
+        self._task, self._count, self._keys = task, task.num_keys, np.arange(task.num_keys)
         # `[E]`, the first key of each entry and its key in each step, the forced one the last.
         self._steps: list[tuple[IndexArray, IndexArray]] = []
-        located = task.keys.cell(np.arange(self._count))
+        located = task.keys.cell(self._keys)
         ways = Ways(task, located, paths[0], np.ones(paths.shape[1]), discount)
         for keys in paths[1:]:
             inside = np.flatnonzero(keys < self._count)
@@ -83,10 +83,7 @@ class _Paths:
 
     def sets(self, policy: PolicyTable) -> list[BoolArray]:
         """Its decisions here, `[G, 1]` for each free choice."""
-        choices = (turn.choice for turn in self._turns)
-        return [
-            policy.chosen(n, each.rows, each.sensors)[:, None] > 0 for n, each in enumerate(choices)
-        ]
+        return sets_of((turn.choice for turn in self._turns), policy, self._keys)
 
     def value(self, sets: list[BoolArray]) -> Array:
         """V `[keys]` of a policy: V = b + K V, K the discounted chance of the key at the next detection."""
@@ -110,10 +107,8 @@ class _Paths:
         plans = self.plans(value)
         sets = plans.ascend(self.sets(policy), sweeps=2)
         found = exchange(plans, sets, np.ones(self._count, dtype=bool))
-        choices = (turn.choice for turn in plans.turns)
         return PolicyTable.from_sensed(
-            self._task,
-            [(c.rows[on[:, 0]], c.sensors[on[:, 0]]) for c, on in zip(choices, found, strict=True)],
+            self._task, sensed((turn.choice for turn in self._turns), found, self._keys)
         )
 
     def gain(self, before: PolicyTable, after: PolicyTable, value: Array) -> Array:

@@ -193,7 +193,10 @@ class ModelBased(Checkpointed):
 
     def _pooled(self, tracks: Tracks, _: PolicyTable | None) -> PolicyTable:
         """The plan for the moves of `tracks`, as if the next one depended on the cell alone."""
-        return lifted(self.task, exchange.solve(self._world(self._of_moves(tracks)), 0))
+        estimate = self._new_estimate()
+        estimate.add_moves(*tracks.steps(self.task.num_cells))
+        world = self._world(estimate.believed(self._least))
+        return lifted(self.task, exchange.solve(world, 0))
 
     def _with_modes(self, tracks: Tracks, before: PolicyTable | None) -> PolicyTable:
         """The plan for a target with hidden modes."""
@@ -203,12 +206,6 @@ class ModelBased(Checkpointed):
         if before is not None:
             return exchange.improve(world, before)
         return hidden.best_found(world, hidden.SHORT)
-
-    def _of_moves(self, tracks: Tracks) -> sparse.csr_array:
-        """`[M, M + 1]`, the kernel of the moves of `tracks`."""
-        estimate = self._new_estimate()
-        estimate.add_moves(*tracks.steps(self.task.num_cells))
-        return estimate.believed(self._least)
 
     def _world(self, kernel: sparse.csr_array) -> World:
         """The task with the motion of a `[M, M + 1]` kernel, the last column its exit, without negligible moves."""

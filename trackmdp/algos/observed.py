@@ -6,6 +6,7 @@ Only the tracker's observations are read: where and when it located the target, 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
@@ -30,10 +31,10 @@ from trackmdp.world.problem_file import as_arrays, from_arrays
 
 _ENDING = 8
 """Cells at the end of a path that identify its recording: wherever a path began, it ends as its recording."""
-_FACTOR = 0x9E3779B97F4A7C15
-"""Odd, so that it has an inverse modulo 2^64."""
 _LONGEST_WAIT = 16
 """Misses of the safe action up to which the cells in between are inferred."""
+_UNKNOWN = -(2**40)
+"""Safe actions before a path that is not known from its beginning."""
 EM_ROUNDS = 400
 """Rounds of expectation-maximisation at most, from the moves seen alone: the result does not depend on earlier ones."""
 
@@ -80,30 +81,6 @@ def path_ends(batch: TensorDictBase) -> Tensor:
     after = batch["next"]
     located: Tensor = after["steps_since_detection"] == 0
     return located | after["terminated"].squeeze(-1)
-
-
-def _waits(
-    batch: TensorDictBase, choices: int, before: IndexArray
-) -> tuple[IndexArray, IndexArray]:
-    """`[K]` misses of the safe action on each path that ends in a batch, and `[B]` safe actions of those that do not.
-
-    Example: with the flags 1 1 0 1 of safe actions, of which the second and the last one locate, and one safe action
-    before the batch, the waits are 2 and 0.
-
-    Args:
-        batch: `[B, time]`.
-        choices: T_max + 1.
-        before: `[B]` safe actions of each row's path before the batch; a large negative number where unknown.
-    """
-    forced = (batch["steps_since_detection"] == choices).cpu().numpy()
-    ended = path_ends(batch).cpu().numpy()
-    ends = ended | batch["next", "done"].squeeze(-1).cpu().numpy()
-    taken = forced.cumsum(axis=1)
-    # Safe actions until the last end, none of them yet: those before the batch count on.
-    base = np.maximum.accumulate(np.where(ends, taken, 0), axis=1)
-    base = np.where(np.logical_or.accumulate(ends, axis=1), base, -before[:, None])
-    since = taken - np.concatenate([-before[:, None], base[:, :-1]], axis=1)
-    return np.where(forced, since - 1, 0)[ended], taken[:, -1] - base[:, -1]
 
 
 @dataclass(frozen=True)
@@ -165,18 +142,38 @@ class SensedPaths:
             self._next += len(done)
             # Where a row begins with a safe action, nobody knows how many missed before.
             forced = batch["steps_since_detection"][:, 0] == self._task.num_choices
-            self._waiting = np.where(forced.cpu().numpy(), -batch.shape[-1] - 1, 0)
+            self._waiting = np.where(forced.cpu().numpy(), _UNKNOWN, 0)
         # Later episodes get new numbers: row by row, for the ones that begin in this batch.
         ends = done.sum(axis=1)
         base = self._next + np.cumsum(ends) - ends
         number = np.where(begun > 0, base[:, None] + begun - 1, self._running[:, None])
         self._running = np.where(ends > 0, base + ends - 1, self._running)
         self._next += int(ends.sum())
-        waits, self._waiting = _waits(batch, self._task.num_choices, self._waiting)
+        waits = self._waits(batch, done > 0)
         self._parts.append(_Sensed(**vars(paths), episode=number[row, time], waits=waits))
         self._tracks = None
         while self._capacity is not None and len(self) > self._capacity and len(self._parts) > 1:
             del self._parts[0]
+
+    def _waits(self, batch: TensorDictBase, done: BoolArray) -> IndexArray:
+        """`[K]` misses of the safe action on each path that ends in a batch: its other steps have other misses.
+
+        Example: of two safe actions after t_max + 1 = 2 misses the second one locates, at the fourth step. There are 3
+        misses on the path, and the clock shows 2.
+        """
+        misses, later = (
+            part["steps_since_detection"].cpu().numpy() for part in (batch, batch["next"])
+        )
+        ended = path_ends(batch).cpu().numpy()
+        row, time = np.nonzero(ended | done)
+        since = misses[:, 0] + self._waiting
+        steps = np.diff(time, prepend=0)
+        first = np.diff(row, prepend=-1) > 0
+        steps[first] = time[first] + 1 + since[row[first]]
+        since += batch.shape[-1]
+        since[row] = batch.shape[-1] - 1 - time  # the last one of each row counts
+        self._waiting = since - np.where((ended | done)[:, -1], 0, later[:, -1])
+        return (steps - 1 - misses[row, time])[ended[row, time]]
 
     def _continued(self, row: IndexArray, begun: IndexArray, start: IndexArray, rows: int) -> bool:
         """Whether every row goes on as the batch before ended; not so where workers deliver in any order."""
@@ -188,10 +185,6 @@ class SensedPaths:
         first = np.flatnonzero((begun == 0) & (np.diff(row, prepend=-1) > 0))
         before = last[self._running[row[first]]]
         return bool(((before >= cells) | (before == start[first])).all())
-
-    def moves(self) -> tuple[IndexArray, IndexArray]:
-        """Cells before and after every step, `[K]` each; M after an exit."""
-        return self.tracks().steps(self._task.num_cells)
 
     def tracks(self) -> Tracks:
         """All paths so far, the unfinished among them; these count as recordings that stop.
@@ -226,7 +219,8 @@ class SensedPaths:
         ends = ends_of(np.bincount(track[inside], minlength=len(exits)))
         line, seen = line[inside], seen[inside]
         names = _recordings(line, seen, ends).astype(np.int64)
-        return Tracks(line, ends, exits, names).select(~_goes_on(line, ends, exits))
+        tracks = Tracks(line, ends, exits, names)
+        return tracks.select(~_goes_on(tracks))
 
     def _filled(self, paths: ObservedPaths, line: Indices, first: Indices) -> IndexArray:
         """The cells of whole paths that begin at places `first`, those that are -1 drawn."""
@@ -272,22 +266,16 @@ def _missed(paths: ObservedPaths) -> Missed:
     return missed
 
 
-def _goes_on(line: IndexArray, first: IndexArray, exits: BoolArray) -> BoolArray:
+def _goes_on(tracks: Tracks) -> BoolArray:
     """`[K]`, paths that stop in the grid where another one, the same up to there, goes on.
 
     Of a recording that was followed to its end they show nothing new. As paths that differ they would count as more
     recordings than there are, and to judge a plan by them is to judge it by what it was learned from.
     """
-    # A number for each path up to each place, a polynomial modulo 2^64: different paths hardly ever share one.
-    powers, inverses = (
-        np.cumprod(np.full(len(line), factor, dtype=np.uint64))
-        for factor in (_FACTOR, pow(_FACTOR, -1, 2**64))
-    )
-    sums = np.cumsum((line + 1).astype(np.uint64) * powers)
-    start = np.repeat(first[:-1], np.diff(first))
-    code = (sums - np.append(np.uint64(0), sums)[start]) * inverses[start]
-    last = first[1:] - 1
-    return ~exits & np.isin(code[last], np.delete(code, last))
+    pieces = tracks.pieces()
+    # In order: a path comes right before one that goes on as it.
+    begun = {some for some, more in pairwise(sorted(set(pieces))) if more.startswith(some)}
+    return ~tracks.exits & np.array([piece in begun for piece in pieces], dtype=np.bool_)
 
 
 def _recordings(line: Array, seen: BoolArray, first: IndexArray) -> IndexArray:

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from trackmdp.algos.common import Checkpointed
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.estimates.path_plans import parted
 from trackmdp.algos.moves import CellIndex, MoveBuffer, cell_dtype
 from trackmdp.algos.observed import EM_ROUNDS, SensedPaths, observed_paths
 from trackmdp.arrays.entries import row_index
-from trackmdp.recordings.tracks import Tracks
 from trackmdp.sensing.task import Task
 
 
-class SegmentBuffer(Checkpointed):
+class SegmentBuffer(SensedPaths):
     """Replay buffer of path segments: a located cell and the cells sensed in the `steps` steps after it, M for outside.
 
     Unlike `MoveBuffer` it never puts a path together from moves of different ones. A segment begins at every step that
@@ -33,8 +31,6 @@ class SegmentBuffer(Checkpointed):
         judge: seed by which recordings are kept from the segments, to judge the learned policies by; None: none.
     """
 
-    parts: ClassVar[tuple[str, ...]] = ("judge", "_paths")
-
     def __init__(
         self,
         task: Task,
@@ -43,32 +39,22 @@ class SegmentBuffer(Checkpointed):
         generator: torch.Generator,
         judge: int | None = None,
     ) -> None:
-        self.steps = steps
-        self.judge = judge
-        self._generator = generator
-        self._keys = task.keys
-        self._paths = SensedPaths(task, capacity)
+        super().__init__(task, capacity)
+        self.steps, self.judge, self._generator, self._keys = steps, judge, generator, task.keys
         self._drawn_from: Tensor | None = None
-
-    def __len__(self) -> int:
-        return len(self._paths)
 
     def extend(self, batch: TensorDictBase) -> None:
         """Add a collected batch, see `SensedPaths`."""
-        self._paths.extend(batch)
+        super().extend(batch)
         self._drawn_from = None
 
     def moves(self) -> tuple[Tensor, Tensor]:
         """Cells, or keys of them, before and after every step, int64 `[K]` each; M after an exit."""
         start, end = (
             torch.as_tensor(part * self._keys.num_classes, device=self._generator.device)
-            for part in self._paths.moves()
+            for part in self.tracks().steps(self._task.num_cells)
         )
         return start, end
-
-    def tracks(self) -> Tracks:
-        """All paths as a whole, the judging ones among them."""
-        return self._paths.tracks()
 
     def segments(self) -> Tensor:
         """`[steps + 1, K]`, in the order of the paths."""
@@ -100,10 +86,14 @@ class SegmentBuffer(Checkpointed):
         drawn = torch.randint(segments.shape[1], (count,), generator=self._generator, device=device)
         return segments.index_select(1, drawn).long()
 
+    def state_dict(self) -> dict[str, Any]:
+        """All that was observed, and what judges."""
+        return {"judge": self.judge, "paths": super().state_dict()}
+
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
-        super().load_state_dict(state)
-        self._drawn_from = None
+        super().load_state_dict(state["paths"])
+        self._drawn_from, self.judge = None, state["judge"]
 
 
 class InferredMoves(MoveBuffer):

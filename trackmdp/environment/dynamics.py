@@ -30,7 +30,6 @@ class Dynamics:
         sampler: paths of the targets.
 
     Attributes:
-        certain: whether a step needs no draw of reports.
         detection: the probability of reports.
         masked: whether `action_mask` is observed.
     """
@@ -44,7 +43,6 @@ class Dynamics:
         self._costs, self._outcomes = Costs(task, device), Outcomes(task, device)
         self._mask = ActionMask(task, device)
         self.masked = self._mask.observed
-        self.certain = self._outcomes.certain
         self._num_cells, self._max_steps = task.num_cells, task.max_steps
         self._safe, self._keys = task.safe, task.keys if task.keyed else None
         self._history = (task.num_choices, task.num_sensors)
@@ -77,7 +75,7 @@ class Dynamics:
             state: before the step.
             action: `[B, K]` bool.
             draws: `[B]` of the moves, see `PathSampler.draw`.
-            reports: `[B]` uniform in [0, 1), of the reports; None where `certain`.
+            reports: `[B]` uniform in [0, 1), of the reports; None where all are certain.
         """
         last, n = state["last_cell"], state["steps_since_detection"]
         place = self._sampler.move(state["place"], draws)

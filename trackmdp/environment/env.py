@@ -162,32 +162,25 @@ class TrackEnv(EnvBase):
         found = not now.state["steps_since_detection"][row]
         return picture(mode, self._grid, int(now.target()[row]), on, found=found)
 
-    def _make_specs(self, world: Task) -> None:
-        b, k, choices = self.batch_size, self.num_sensors, self.t_max + 1
-
-        def numbers(count: int, *each: int) -> Categorical:
-            shape = torch.Size((*b, *each))
-            return Categorical(count, shape=shape, dtype=torch.int64, device=self.device)
+    def _make_specs(self, task: Task) -> None:
+        b = self.batch_size
 
         def bits(*shape: int) -> Binary:
             return Binary(shape=(*b, *shape), dtype=torch.bool, device=self.device)
 
+        # n takes t_max + 2 values: 0 ... t_max + 1, the last one with the safe action forced.
+        values = {"last_cell": task.num_cells, "steps_since_detection": task.t_max + 2}
+        values |= {"key": task.num_keys, "step_count": (task.max_steps or 0) + 1}
+        state = self._tracking.dynamics.start(torch.zeros(self._tracking.each, dtype=torch.int64))
+        del state["place"]
         observed = {
-            # n takes t_max + 2 values: 0 ... t_max + 1, the last one with the safe action forced.
-            "last_cell": numbers(self.num_cells, *self._targets),
-            "steps_since_detection": numbers(choices + 1, *self._targets),
-            "action_history": bits(choices, k),
+            name: Categorical(values[name], torch.Size((*b, *each.shape[1:])), self.device)
+            if name in values
+            else bits(*each.shape[1:])
+            for name, each in state.items()
         }
-        if self._targets:
-            observed["present"] = bits(*self._targets)
-        if world.keyed:
-            observed["key"] = numbers(world.num_keys)
-        if self.max_steps:
-            observed["step_count"] = numbers(self.max_steps + 1)
-        if self._tracking.dynamics.masked:
-            observed["action_mask"] = bits(k)
         self.observation_spec = Composite(observed, shape=b)
-        self.action_spec = bits(k)
+        self.action_spec = bits(self.num_sensors)
         self.reward_spec = Unbounded((*b, 1), device=self.device)
         self.done_spec = Composite({name: bits(1) for name in FLAGS}, shape=b)
         self._observed = tuple(observed)

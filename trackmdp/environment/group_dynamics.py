@@ -23,7 +23,6 @@ class GroupDynamics:
         targets: K.
 
     Attributes:
-        certain: whether a step needs no draw of reports.
         masked: whether some cells have no sensor, so that `action_mask` is observed.
         waits: whether targets may enter later.
     """
@@ -34,7 +33,6 @@ class GroupDynamics:
         self._cells, self._max_steps, self._t_max = task.num_cells, task.max_steps, task.t_max
         self._costs, self._history = Costs(task, device), (task.num_choices, task.total_sensors)
         self._reward, self._safe = task.reward, task.safe_cost
-        self.certain = task.perfect and task.safe
         # Of the sensors, and of the safe action.
         chances = np.stack([task.detection, task.safe_detection])
         self._detection = torch.as_tensor(chances, device=device)

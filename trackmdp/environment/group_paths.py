@@ -11,6 +11,7 @@ from torch import Tensor
 from trackmdp.arrays.types import BoolArray, IndexArray
 from trackmdp.environment.paths import PathSampler, path_sampler
 from trackmdp.environment.targets import RecordedTargets, Targets
+from trackmdp.motion.chain import Motion
 from trackmdp.recordings.together import Together
 from trackmdp.seeding import derive
 from trackmdp.world.group import Group
@@ -38,7 +39,7 @@ class GroupPaths:
         recorded, self.cells = group.recorded, group.task.num_cells
         self.together: Together | None = None
         if recorded is None:
-            self.sampler = PathSampler(group.kernel, device=device)
+            self.sampler = PathSampler(Motion.of(group.kernel), group.kernel.shape[0], device)
         else:
             self.sampler = path_sampler(recorded, device, held_out=held_out)
             tracks = recorded.held_out if held_out else recorded.tracks
@@ -127,8 +128,8 @@ class Walks:
 class TrackMembers(RecordedTargets):
     """Targets of all groups in a row, `[B K]`: each start is that of one, whom others join that overlap with it."""
 
-    def __init__(self, paths: GroupPaths, together: Together) -> None:
-        super().__init__(paths.sampler)
+    def __init__(self, paths: GroupPaths, together: Together, missed: bool) -> None:
+        super().__init__(paths.sampler, missed)
         self._together = together
 
     def _start(self, rows: Tensor) -> Tensor:
@@ -143,8 +144,8 @@ class TrackMembers(RecordedTargets):
         return place.view(-1)
 
 
-def group_members(paths: GroupPaths, count: int) -> Targets:
+def group_members(paths: GroupPaths, count: int, missed: bool) -> Targets:
     """The targets of `count` groups that follow `paths`, each at the start in a cell of its own motion."""
     if paths.together is not None:
-        return TrackMembers(paths, paths.together)
-    return Targets(paths.sampler, paths.cells, paths.offset.repeat(count))
+        return TrackMembers(paths, paths.together, missed)
+    return Targets(paths.sampler, missed, paths.cells, paths.offset.repeat(count))

@@ -12,6 +12,7 @@ from scipy import sparse
 from torch import Tensor
 
 from trackmdp.errors import UserError
+from trackmdp.motion.chain import Motion
 from trackmdp.world.problem import Problem
 
 RESOLUTION = 2**40
@@ -32,12 +33,8 @@ class PathSampler:
     support of the row. All ends are whole numbers, so that the search is exact.
 
     Args:
-        moves: `[Z, Z]` sub-stochastic CSR; a row sums to 1 less the probability of the exit.
-        cell: `[Z]`, the cell of each state; None: Z cells, each a state.
+        motion: the chain.
         num_cells: M, the cell of the exit.
-        first: `[F]`, states in which episodes start, each equally likely; None: all.
-        modes: H; z % H is the mode of a state where there are several.
-        ends: `[Z]`, whether a recording stops in a state; None: nowhere.
         device: device of the tables.
 
     Attributes:
@@ -47,30 +44,20 @@ class PathSampler:
         UserError: there are too many states for exact sampling.
     """
 
-    def __init__(
-        self,
-        moves: sparse.csr_array,
-        cell: npt.NDArray[np.int64] | None = None,
-        *,
-        num_cells: int | None = None,
-        first: npt.NDArray[np.int64] | None = None,
-        modes: int = 1,
-        ends: npt.NDArray[np.bool_] | None = None,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        states = moves.shape[0]
-        self.device, self.num_states, self.modes = torch.device(device), states, modes
-        self.starts = states if first is None else len(first)
-        exit_cell = states if num_cells is None else num_cells
-        tables = {
-            "_cells": None if cell is None else np.append(cell, exit_cell),
-            "_first": first,
-            "_ends": None if ends is None else np.append(ends, False),
-        }
-        for name, table in tables.items():
-            made = None if table is None else torch.as_tensor(table, device=device)
-            setattr(self, name, made)
-        self._make_edges(moves)
+    def __init__(self, motion: Motion, num_cells: int, device: torch.device | str = "cpu") -> None:
+        states, device = motion.num_states, torch.device(device)
+        self.device, self.num_states, self.modes = device, states, motion.modes
+        self.starts = len(motion.first)
+        # None: all states, each a cell, and nowhere; else with the exit's entry.
+        self._first = self._cells = self._ends = None
+        if self.starts < states:
+            self._first = torch.as_tensor(motion.first.astype(np.int64), device=device)
+        if not self.starts == states == num_cells:
+            cells = np.append(motion.cell.astype(np.int64), num_cells)
+            self._cells = torch.as_tensor(cells, device=device)
+        if motion.ends is not None:
+            self._ends = torch.as_tensor(np.append(motion.ends, False), device=device)
+        self._make_edges(motion.moves)
 
     def _make_edges(self, moves: sparse.csr_array) -> None:
         """Upper ends of the intervals, and the successor of each."""
@@ -94,15 +81,11 @@ class PathSampler:
         else:
             # Padded to one length, which reads far less than a search on the line of a large grid.
             filled = np.arange(self._length) < lengths[:, None]
-            ends, following = (
-                _padded(filled, *each) for each in ((ends, RESOLUTION), (following, states))
-            )
+            tables = np.full((2, *filled.shape), [[[RESOLUTION]], [[states]]])
+            tables[:, filled] = ends, following
+            ends, following = tables
         self._edges = torch.as_tensor(ends, device=self.device)
         self._successors = torch.as_tensor(following.ravel(), device=self.device)
-
-    _cells: Tensor | None
-    _first: Tensor | None
-    _ends: Tensor | None
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """`[count]` int64 draws below `RESOLUTION`, for `move`."""
@@ -139,15 +122,6 @@ class PathSampler:
         return None if self._ends is None else self._ends.index_select(0, place)
 
 
-def _padded(
-    filled: npt.NDArray[np.bool_], values: npt.NDArray[np.int64], rest: int
-) -> npt.NDArray[np.int64]:
-    """`values` in the places of the mask `filled`, row by row, and `rest` in all others."""
-    table = np.full(filled.shape, rest, dtype=np.int64)
-    table[filled] = values
-    return table
-
-
 def _running_sums(moves: sparse.csr_array) -> npt.NDArray[np.float64]:
     """`[nnz]`, for each entry the sum of its row up to and including it, added from left to right."""
     sums, lengths = moves.data.astype(np.float64), np.diff(moves.indptr)
@@ -162,14 +136,4 @@ def path_sampler(
     problem: Problem, device: torch.device | str = "cpu", *, held_out: bool = False
 ) -> PathSampler:
     """Paths of a world's targets, or along the tracks of a `Recorded` to learn from or, on request, held out."""
-    motion = problem.sampled(held_out=held_out)
-    plain = len(motion.first) == motion.num_states == problem.num_cells
-    return PathSampler(
-        motion.moves,
-        None if plain else motion.cell.astype(np.int64),
-        num_cells=problem.num_cells,
-        first=None if len(motion.first) == motion.num_states else motion.first.astype(np.int64),
-        modes=motion.modes,
-        ends=motion.ends,
-        device=device,
-    )
+    return PathSampler(problem.sampled(held_out=held_out), problem.num_cells, device)

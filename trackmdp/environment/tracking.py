@@ -7,11 +7,11 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from trackmdp.environment.draws import UniformDraws
 from trackmdp.environment.dynamics import Dynamics, State, rowwise
 from trackmdp.environment.group_dynamics import GroupDynamics
 from trackmdp.environment.group_paths import GroupPaths, group_members
-from trackmdp.environment.targets import Targets, make_targets
+from trackmdp.environment.paths import path_sampler
+from trackmdp.environment.targets import RecordedTargets, Targets
 from trackmdp.world.group import Group
 from trackmdp.world.problem import Problem
 
@@ -29,6 +29,7 @@ class Tracking:
     Attributes:
         device: of the tensors.
         dynamics: initial states and steps as pure functions.
+        each: targets of a row.
         state: of all targets, empty before the first restart. Its tensors are replaced, never written to, as they are
             those observed.
     """
@@ -36,17 +37,18 @@ class Tracking:
     dynamics: Dynamics | GroupDynamics
 
     def __init__(self, problem: Problem | Group, count: int, device: torch.device) -> None:
-        self.device, task, self._each = device, problem.single, len(problem.targets) or 1
+        self.device, task, self.each = device, problem.single, len(problem.targets) or 1
         self._t_max, self._cells = task.t_max, torch.arange(task.num_cells, device=device)
+        missed = not (task.perfect and task.safe)
         if isinstance(problem, Group):
             paths = GroupPaths(problem, device)
-            self._targets: Targets = group_members(paths, count)
-            self.dynamics = GroupDynamics(task, paths, self._each)
+            self._targets = group_members(paths, count, missed)
+            self.dynamics = GroupDynamics(task, paths, self.each)
         else:
-            self._targets = make_targets(problem, device)
+            kind = Targets if problem.recorded is None else RecordedTargets
+            self._targets = kind(path_sampler(problem, device), missed)
             self.dynamics = Dynamics(problem, self._targets.sampler)
-        self._reports = UniformDraws(device, None if self.dynamics.certain else "report")
-        self._every = torch.ones(count * self._each, dtype=torch.bool, device=device)
+        self._every = torch.ones(count * self.each, dtype=torch.bool, device=device)
         self.state: State = {}
         # Of the last step: the action, the last located cells and the misses before it; and masks `[B, 1]` of the rows
         # begun anew since.
@@ -56,14 +58,10 @@ class Tracking:
     def seed(self, seed: int, stream: str) -> None:
         """Start the generators anew; their names begin with `stream`."""
         self._targets.seed(seed, stream)
-        self._reports.seed(seed, stream)
 
     def snapshot(self) -> dict[str, dict[str, Tensor]]:
         """The state, and the states of the generators."""
-        return {
-            "rows": dict(self.state),
-            "generators": self._targets.state() | self._reports.state(),
-        }
+        return {"rows": dict(self.state), "generators": self._targets.state()}
 
     def load(self, snapshot: Snapshot) -> None:
         """Continue from a `snapshot`.
@@ -73,17 +71,13 @@ class Tracking:
         """
         rows = {key: value.to(self.device) for key, value in snapshot["rows"].items()}
         self._check(rows)
-        before = self._targets.state() | self._reports.state()
+        before = self._targets.state()
         try:
-            self._load_generators(snapshot["generators"])
+            self._targets.load_state(snapshot["generators"])
         except BaseException:
-            self._load_generators(before)
+            self._targets.load_state(before)
             raise
         self.state, self._acted = rows, None
-
-    def _load_generators(self, states: Mapping[str, Tensor]) -> None:
-        for draws in (self._targets, self._reports):
-            draws.load_state(states)
 
     def _check(self, rows: State) -> None:
         """Raise a ValueError unless `rows` have the form of a state and the targets are in places that exist."""
@@ -105,7 +99,7 @@ class Tracking:
         """New episodes in the rows of a mask `[B, 1]`."""
         self._begun.append(done)
         state, rows = self.state, done.squeeze(-1)
-        begun = rows if self._each == 1 else done.expand(-1, self._each).reshape(-1)
+        begun = rows if self.each == 1 else done.expand(-1, self.each).reshape(-1)
         if torch.compiler.is_compiling() or self.device.type != "cpu":
             # No shape and no branch may depend on the number of rows.
             fresh = self.dynamics.start(self._targets.start(begun))
@@ -124,7 +118,7 @@ class Tracking:
     def step(self, action: Tensor) -> State:
         """One step with the sensors of `action` `[B, S]` bool on; returns the state, the reward and the flags."""
         state = self.state
-        draws, reports = self._targets.draw(self._every), self._reports(self._every)
+        draws, reports = self._targets.draw(self._every), self._targets.reports(self._every)
         following = self.dynamics.advance(state, action, draws, reports)
         self._acted = action, state["last_cell"], state["steps_since_detection"]
         self._begun = []

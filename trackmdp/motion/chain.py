@@ -9,6 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from trackmdp.arrays.entries import row_sums
+
 Indices = npt.NDArray[np.integer[Any]]
 
 
@@ -34,6 +36,12 @@ class Motion:
     stay: npt.NDArray[np.float64]
     modes: int = 1
     ends: npt.NDArray[np.bool_] | None = None
+
+    @classmethod
+    def of(cls, moves: sparse.csr_array, modes: int = 1) -> Motion:
+        """The chain of (cell, mode), in each of which episodes start."""
+        states = np.arange(moves.shape[0])
+        return cls(moves, states // modes, states, row_sums(moves), modes)
 
     @property
     def num_states(self) -> int:

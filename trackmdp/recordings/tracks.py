@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Unpack
 
@@ -63,6 +64,11 @@ class Tracks:
         return Tracks(
             cells, ends_of(lengths[chosen]), self.exits[chosen], self.names[chosen], begins
         )
+
+    def pieces(self) -> list[bytes]:
+        """The cells of each track as bytes: NumPy takes ten times as long to split an array."""
+        cells, ends = self.cells.tobytes(), (self.first * self.cells.itemsize).tolist()
+        return [cells[begin:end] for begin, end in pairwise(ends)]
 
     def limited(self, max_steps: int | None) -> Tracks:
         """The tracks, cut off after `max_steps` steps; None for never."""

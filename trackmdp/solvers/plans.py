@@ -11,7 +11,7 @@ each of the C candidates of its plan, `[G, C]` one for each decision. Step t has
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,6 +20,7 @@ from scipy import sparse
 
 from trackmdp.arrays.entries import summing, with_data
 from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
+from trackmdp.policies.table import SetTable
 from trackmdp.sensing.decisions import Decisions
 
 
@@ -61,6 +62,24 @@ class Turn:
     def pay(self) -> sparse.csr_array:
         """`[K, G]`, prices of the decisions of each row, which are in order."""
         return with_data(summing(self.choice.rows, self.choice.count), self.price)
+
+
+def sets_of(choices: Iterable[Decisions], policy: SetTable, plans: IndexArray) -> list[BoolArray]:
+    """`[G, 1]` for each free choice, the sets of a policy that does not draw; its `plans` `[K]` are the rows'."""
+    return [
+        policy.chosen(n, plans[each.rows], each.sensors)[:, None] > 0
+        for n, each in enumerate(choices)
+    ]
+
+
+def sensed(
+    choices: Iterable[Decisions], sets: Iterable[BoolArray], plans: IndexArray
+) -> list[tuple[IndexArray, IndexArray]]:
+    """For each free choice the plans and their sensors on, by sets `[G, 1]`; `plans` `[K]` are the rows'."""
+    some = (np.flatnonzero(on) for on in sets)
+    return [
+        (plans[each.rows[on]], each.sensors[on]) for each, on in zip(choices, some, strict=True)
+    ]
 
 
 class Plans:

@@ -25,7 +25,7 @@ from trackmdp.sensing.task import Task
 from trackmdp.solvers.events import Events
 from trackmdp.solvers.linear import DIRECT_CELLS, TOLERANCE, RenewalSystem
 from trackmdp.solvers.mass import Passed, passed, passed_last
-from trackmdp.solvers.plans import Plans, Turn
+from trackmdp.solvers.plans import Plans, Turn, sensed, sets_of
 from trackmdp.solvers.value import event_groups, first_events, whole_renewals
 from trackmdp.solvers.walk import Step, Walk, all_events
 from trackmdp.world.model import World
@@ -209,18 +209,11 @@ class Renewal:
 
     def sets(self, policy: PolicyTable) -> list[BoolArray]:
         """The sets of a deterministic policy; sensors where the target cannot be are left out."""
-        return [
-            policy.chosen(n, self.plans[choice.rows], choice.sensors)[:, None] > 0
-            for n, choice in enumerate(self.choices)
-        ]
+        return sets_of(self.choices, policy, self.plans)
 
     def table(self, sets: Sequence[BoolArray]) -> PolicyTable:
         """The policy of sets; a key that cannot occur has none."""
-        some = [np.flatnonzero(on) for on in sets]
-        parts = zip(self.choices, some, strict=True)
-        return PolicyTable.from_sensed(
-            self.task, [(self.plans[choice.rows[on]], choice.sensors[on]) for choice, on in parts]
-        )
+        return PolicyTable.from_sensed(self.task, sensed(self.choices, sets, self.plans))
 
 
 def check_room(task: Task, motion: Motion, events: Events) -> None:

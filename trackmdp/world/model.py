@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.arrays.entries import row_sums
 from trackmdp.arrays.numbers import whole_number
 from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError
@@ -116,8 +115,7 @@ class World(Task):
     @cached_property
     def motion(self) -> Motion:
         """The target as a chain of hidden states."""
-        states = np.arange(self.num_states)
-        return Motion(self.kernel, states // self.modes, states, self.stay_probability, self.modes)
+        return Motion.of(self.kernel, self.modes)
 
     def sampled(self, *, held_out: bool = False) -> Motion:  # noqa: ARG002
         """The chain that targets are drawn from, the same in training and evaluation."""
@@ -134,10 +132,10 @@ class World(Task):
             [np.bincount(mode, moves.data * step, self.modes) / weight for step in steps], axis=1
         )
 
-    @cached_property
+    @property
     def stay_probability(self) -> Array:
         """`[Z]` probability of still being in the grid after one step, 1 - p_exit."""
-        return row_sums(self.kernel)
+        return self.motion.stay
 
 
 def motion_words(kernel: sparse.csr_array, state: str) -> str:

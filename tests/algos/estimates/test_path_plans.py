@@ -13,8 +13,7 @@ from scipy import sparse
 from tests.algos.estimates.test_path_counts import planned
 from tests.tracks import by_hand, recorded
 from trackmdp.algos.estimates import path_plans
-from trackmdp.algos.estimates.key_plans import KeyPlans, along
-from trackmdp.algos.estimates.path_gains import AlongPaths, Paths, thinned
+from trackmdp.algos.estimates.path_gains import AlongPaths, KeyPlans, Paths, along, thinned
 from trackmdp.algos.estimates.path_plans import PRIORS, choose_plan, exchanged_keys, parted
 from trackmdp.policies.table import PolicyTable, SetTable
 from trackmdp.recordings.tracks import Recorded, Tracks

@@ -57,11 +57,11 @@ class AlikeCells:
         counts: sparse.csr_array | None = None,
         classes: IndexArray | None = None,
     ) -> None:
-        self.rows, self.columns = size
-        row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
+        rows, columns = size
+        row, column = np.divmod(np.arange(rows * columns), columns)
         # Distances to the four borders, up to the reach. On 5 x 5 cells with reach 1, the 9 inner cells are of one
         # group, the 3 cells between two corners of another one for each border, and each corner is alone.
-        margins = np.stack([row, self.rows - 1 - row, column, self.columns - 1 - column], axis=1)
+        margins = np.stack([row, rows - 1 - row, column, columns - 1 - column], axis=1)
         margins = np.minimum(margins, reach)
         features = margins if classes is None else np.column_stack([margins, classes])
         _, first, groups = np.unique(features, axis=0, return_index=True, return_inverse=True)

@@ -7,8 +7,8 @@ expectation-maximisation, Celeux and Diebolt 1985). What a stop tells of moves t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -50,13 +50,13 @@ def redrawn(
     """
     at, line = np.flatnonzero(unknown), replace(line, cells=line.cells.copy())
     for _ in range(_SWEEPS):
-        moves = _Moves.of(task, line, unknown)
+        moves = Moves(task, line, unknown)
         if len(moves.moves) > _MOST_MOVES:
             break
         # A draw looks at the next two cells: every third one is drawn at once.
         for turn in range(3):
             own = np.flatnonzero(at % 3 == turn)
-            mode = headings(task, line, moves.moves)
+            mode = moves.headings(line)
             for part in np.array_split(own, 1 + len(own) * len(moves.moves) // _AT_ONCE):
                 place = at[part]
                 chance = moves.likelihood(line, mode, place)
@@ -65,43 +65,64 @@ def redrawn(
     return line.cells
 
 
-@dataclass(frozen=True)
-class _Moves:
-    """How often cells followed each other on complete tracks.
+class Moves:
+    """How often cells followed each other on complete tracks; displacements that were never sensed do not count.
+
+    Args:
+        task: its grid.
+        line: the tracks.
+        unknown: `[P]`, which of their cells were not sensed.
 
     Attributes:
-        task: its grid.
-        moves: `[H]`, the `displacements`.
-        counts: how often a cell (b), with its `headings` (m) and with the next cell (c), came before a next cell: the
-            codes that came, in order, and their numbers.
+        moves: `[H]`, the displacements sensed, each as one number (`shift`), in increasing order; 0 for a stop is
+            always one.
     """
 
-    task: Task
-    moves: IndexArray
-    counts: Mapping[str, tuple[IndexArray, IndexArray]]
-
-    @classmethod
-    def of(cls, task: Task, line: Tracks, unknown: BoolArray) -> _Moves:
-        """The moves on complete tracks; displacements that were never sensed do not count."""
+    def __init__(self, task: Task, line: Tracks, unknown: BoolArray) -> None:
+        self._size, self._cells = task.size, task.num_cells
         goes_on = np.ones(len(line.cells), dtype=bool)
         goes_on[line.first[1:] - 1] = False
         at = np.flatnonzero(goes_on)
         before, after = line.cells[at], line.cells[at + 1]
+        number, inside = self.shift(before, after), after < self._cells
         sensed = ~(unknown[at] | unknown[at + 1])
         sensed |= not sensed.any()
-        moves = displacements(task, before[sensed], after[sensed])
-        possible = (after == task.num_cells) | np.isin(shift(task, before, after), moves)
+        self.moves = np.unique(np.append(number[sensed & inside], 0))
+        possible = ~inside | np.isin(number, self.moves)
         at, before, after = at[possible], before[possible], after[possible]
-        codes = _codes(task, moves, before, headings(task, line, moves)[at], after)
-        counts = {name: np.unique(each, return_counts=True) for name, each in codes.items()}
-        return cls(task, moves, counts)
+        codes = self._codes(before, self.headings(line)[at], after)
+        # How often a cell (b), with its heading (m) and with the next cell (c), came before a next cell: the codes that
+        # came, in order, and their numbers.
+        self._counts = {name: np.unique(each, return_counts=True) for name, each in codes.items()}
+
+    def shift(self, before: IndexArray, after: IndexArray) -> IndexArray:
+        """One number for each pair of rows and columns moved, on C columns down · (2 C + 1) + across."""
+        # Cell x in row i and column j is at i (2 C + 1) + j = x + i (C + 1): remainders would take twice as long again.
+        columns = self._size[1]
+        down = after // columns - before // columns
+        return after - before + down * (columns + 1)
+
+    def headings(self, line: Tracks) -> IndexArray:
+        """`[P]` modes at the points of closed tracks: twice the place in `moves`, 1 more after a stop."""
+        cells, place = line.cells, np.arange(len(line.cells))
+        number = np.zeros(len(cells), dtype=np.int64)
+        number[1:] = self.shift(cells[:-1], cells[1:])
+        number[line.first[:-1]] = 0
+        begin = np.repeat(line.first[:-1], line.lengths)
+        moved = np.maximum.accumulate(np.where((number != 0) | (place == begin), place, 0))
+        return 2 * np.searchsorted(self.moves, number[moved]) + (moved < place)
+
+    def heading_after(self, mode: IndexArray, before: IndexArray, after: IndexArray) -> IndexArray:
+        """The modes after moves from cells `before` to cells `after`, see `headings`."""
+        number = self.shift(before, after)
+        return np.where(number == 0, mode // 2 * 2 + 1, 2 * np.searchsorted(self.moves, number))
 
     def candidates(self, last: IndexArray) -> tuple[IndexArray, BoolArray]:
         """`[K, H]` cells that the `moves` lead to from cells `last` `[K]`, and whether they are in the grid."""
-        columns = self.task.columns
+        columns = self._size[1]
         down, across = np.divmod(self.moves + columns, 2 * columns + 1)
         row, column = last[:, None] // columns + down, last[:, None] % columns + across - columns
-        cell, inside = cell_at(self.task.size, row, column)
+        cell, inside = cell_at(self._size, row, column)
         return np.where(inside, cell, 0), inside
 
     def likelihood(self, line: Tracks, mode: IndexArray, at: IndexArray) -> Array:
@@ -111,9 +132,9 @@ class _Moves:
         place = np.minimum(at + 2, len(line.cells) - 1)
         ends = np.isin(at + 2, line.first)  # the next cell is the track's last one
         later, last = line.cells[place][:, None], last[:, None]
-        then = heading_after(self.task, self.moves, known, last, cell)
+        then = self.heading_after(known, last, cell)
         chance = self._chance(last, known, cell) * self._chance(cell, then, after)
-        afterwards = heading_after(self.task, self.moves, then, cell, after)
+        afterwards = self.heading_after(then, cell, after)
         chance *= np.where(ends[:, None], 1.0, self._chance(after, afterwards, later))
         return chance * inside
 
@@ -126,51 +147,17 @@ class _Moves:
 
     def _chance(self, cell: IndexArray, mode: IndexArray, after: IndexArray) -> Array:
         """Probability of the next cell."""
-        codes = _codes(self.task, self.moves, cell, mode, after)
         count = {}
-        for name, wanted in codes.items():
-            came, times = self.counts[name]
+        for name, wanted in self._codes(cell, mode, after).items():
+            came, times = self._counts[name]
             place, known = among(came, wanted)
             count[name] = np.where(known, times[place], 0)
         alone: Array = count["bc"] / np.maximum(count["b"], 1.0)
         return (count["bmc"] + _WEIGHT * alone) / (count["bm"] + _WEIGHT) + _LEAP
 
-
-def _codes(
-    task: Task, moves: IndexArray, cell: IndexArray, mode: IndexArray, after: IndexArray
-) -> dict[str, IndexArray]:
-    """One number for each combination of cells and modes; a move that was never seen has a mode of its own."""
-    known, wide = cell * (2 * len(moves) + 2) + mode, task.num_cells + 1
-    return {"b": cell, "bc": cell * wide + after, "bm": known, "bmc": known * wide + after}
-
-
-def displacements(task: Task, before: IndexArray, after: IndexArray) -> IndexArray:
-    """`[H]`, the moves seen, each as one number (`shift`), in increasing order; 0 for a stop is always one."""
-    inside = after < task.num_cells
-    return np.unique(np.append(shift(task, before[inside], after[inside]), 0))
-
-
-def headings(task: Task, line: Tracks, moves: IndexArray) -> IndexArray:
-    """`[P]` modes at the points of closed tracks: twice the place in `moves`, 1 more after a stop."""
-    cells, place = line.cells, np.arange(len(line.cells))
-    number = np.zeros(len(cells), dtype=np.int64)
-    number[1:] = shift(task, cells[:-1], cells[1:])
-    number[line.first[:-1]] = 0
-    begin = np.repeat(line.first[:-1], line.lengths)
-    moved = np.maximum.accumulate(np.where((number != 0) | (place == begin), place, 0))
-    return 2 * np.searchsorted(moves, number[moved]) + (moved < place)
-
-
-def heading_after(
-    task: Task, moves: IndexArray, mode: IndexArray, before: IndexArray, after: IndexArray
-) -> IndexArray:
-    """The modes after moves from cells `before` to cells `after`, see `headings`."""
-    number = shift(task, before, after)
-    return np.where(number == 0, mode // 2 * 2 + 1, 2 * np.searchsorted(moves, number))
-
-
-def shift(task: Task, before: IndexArray, after: IndexArray) -> IndexArray:
-    """One number for each pair of rows and columns moved, on C columns down · (2 C + 1) + across."""
-    # Cell x in row i and column j is at i (2 C + 1) + j = x + i (C + 1): remainders would take twice as long again.
-    down = after // task.columns - before // task.columns
-    return after - before + down * (task.columns + 1)
+    def _codes(
+        self, cell: IndexArray, mode: IndexArray, after: IndexArray
+    ) -> dict[str, IndexArray]:
+        """One number for each combination of cells and modes; a move that was never seen has a mode of its own."""
+        known, wide = cell * (2 * len(self.moves) + 2) + mode, self._cells + 1
+        return {"b": cell, "bc": cell * wide + after, "bm": known, "bmc": known * wide + after}

@@ -24,6 +24,7 @@ from trackmdp.arrays.entries import ones_at, per_row, row_index, with_data
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.grid.displacements import apart, cell_at, displacement
 from trackmdp.grid.size import grid_size
+from trackmdp.sensing.task import window_cells
 from trackmdp.world.problem_file import as_arrays, from_arrays
 
 _SETTLED = 1e-5
@@ -150,7 +151,7 @@ class KernelEstimate:
     def mean(self) -> sparse.csr_array:
         """`[M, M + 1]` posterior mean; the last column is the exit."""
         moves, exits = self._parameters()
-        return self._kernel(moves, exits[:, 0] / exits.sum(axis=1))
+        return self._kernel(moves, exits[0] / sum(exits))
 
     def believed(self, least: float = 0.0) -> sparse.csr_array:
         """`[M, M + 1]` posterior mean under a prior that is estimated as well, which plans are made on.
@@ -181,7 +182,7 @@ class KernelEstimate:
         scale = (1.0 - share * total)[rows]
         moves = with_data(moved, likely * scale) + sparse.diags_array(share) @ typical
         moves.eliminate_zeros()
-        return self._kernel(moves, exits[:, 0] / exits.sum(axis=1))
+        return self._kernel(moves, exits[0] / sum(exits))
 
     def samples(self, rng: np.random.Generator, count: int) -> Iterator[sparse.csr_array]:
         """`[M, M + 1]` kernels drawn from the posterior, censored paths taken at their expected moves."""
@@ -192,9 +193,7 @@ class KernelEstimate:
             # A Dirichlet draw is a row of gamma draws, scaled to 1; 1e-300 keeps a row of tiny parameters from 0 / 0.
             weights = with_data(moves, rng.standard_gamma(moves.data) + 1e-300)
             # Where exits are rare and few were seen most draws are 0 but for rounding, and an episode may never end.
-            drawn = self._kernel(
-                weights, np.maximum(rng.beta(exits[:, 0], exits[:, 1]), LEAST_EXIT)
-            )
+            drawn = self._kernel(weights, np.maximum(rng.beta(*exits), LEAST_EXIT))
             yield drawn if alike is None else alike.spread(drawn)
 
     def _alike(self) -> AlikeCells:
@@ -219,8 +218,8 @@ class KernelEstimate:
         """`[M, M + 1]` counts, of cells that move alike together."""
         return self.counts if self.share_cells is False else self._alike().pooled(self.counts)
 
-    def _parameters(self) -> tuple[sparse.csr_array, Array]:
-        """Dirichlet parameters `[M, M]` of the moves and Beta parameters `[M, 2]` of the exit."""
+    def _parameters(self) -> tuple[sparse.csr_array, tuple[Array, Array]]:
+        """Dirichlet parameters `[M, M]` of the moves and Beta parameters `[M]` of the exit."""
         counts = self._pooled()
         moved = counts[:, :-1]
         moves = moved + self.weight * self._typical_moves(moved)
@@ -228,15 +227,13 @@ class KernelEstimate:
         moves.sort_indices()  # draws are made entry by entry, row by row
         return moves, self._exits(counts)
 
-    def _exits(self, counts: sparse.csr_array) -> Array:
-        """Beta parameters `[M, 2]` of the exit."""
+    def _exits(self, counts: sparse.csr_array) -> tuple[Array, Array]:
+        """Beta parameters `[M]` of the exit."""
         moved, left = counts[:, :-1].sum(axis=1), counts[:, [-1]].toarray()[:, 0]
         # half an exit in one more move keeps the pooled probability between 0 and 1 before any exit is seen
         pooled = (left.sum() + 0.5) / (counts.sum() + 1.0)
         # Beta(exits + w p, moves + w (1 - p)), with p the pooled exit probability and w the weight of the prior.
-        return np.stack(
-            [left + self.exit_weight * pooled, moved + self.exit_weight * (1 - pooled)], axis=1
-        )
+        return left + self.exit_weight * pooled, moved + self.exit_weight * (1 - pooled)
 
     def _open_moves(self, paths: ObservedPaths) -> sparse.csr_array:
         """`[M, M + 1]` uniform over the cells that one move may reach, judging by the fastest path seen."""
@@ -303,24 +300,19 @@ class KernelEstimate:
 
     def _near(self, reach: int) -> sparse.csr_array:
         """`[M, M]` uniform over the cells up to `reach` rows and columns away."""
-        row, column = (
-            np.arange(-min(reach, side), min(reach, side) + 1) for side in (self.rows, self.columns)
-        )
-        rows, columns = (part.ravel() for part in np.meshgrid(row, column, indexing="ij"))
-        near = self._put_down(rows, columns, np.ones(len(rows)))
+        near = window_cells((self.rows, self.columns), reach).astype(np.float64)
         return sparse.diags_array(1.0 / near.sum(axis=1)) @ near
 
     def _put_down(
-        self, rows: IndexArray, columns: IndexArray, weight: Array, begin: IndexArray | None = None
+        self, rows: IndexArray, columns: IndexArray, weight: Array, begin: IndexArray
     ) -> sparse.csr_array:
-        """`[M, M]` displacements `[S]` from every cell, or those of class `begin` `[S]`, but for ends outside."""
+        """`[M, M]` displacements `[S]` from every cell of mode `begin` `[S]`, but for ends outside."""
         parts, count = [], max(1, _PLACES // max(1, len(weight)))
         for first in range(0, self.num_cells, count):
             cells = np.arange(first, min(first + count, self.num_cells))[:, None]
             row, column = cells // self.columns + rows, cells % self.columns + columns
             end, inside = cell_at((self.rows, self.columns), row, column)
-            if begin is not None:
-                inside &= cells % self._modes == begin
+            inside &= cells % self._modes == begin
             # [cells, S] in row-major order, as `end` below lists its entries.
             start, which = np.nonzero(inside)
             place, shape = (start, end[inside]), (len(cells), self.num_cells)

@@ -15,8 +15,7 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from trackmdp.algos.estimates.key_plans import KeyPlans, along, interleaved
-from trackmdp.algos.estimates.path_gains import Paths
+from trackmdp.algos.estimates.path_gains import KeyPlans, Paths, along, interleaved
 from trackmdp.algos.estimates.prior_means import PriorMeans
 from trackmdp.arrays.entries import ones_at, per_row
 from trackmdp.arrays.types import Array, BoolArray, IndexArray

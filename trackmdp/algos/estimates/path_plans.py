@@ -12,19 +12,26 @@ from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
+from scipy import sparse
 
-from trackmdp.algos.estimates.key_plans import KeyPlans, along
 from trackmdp.algos.estimates.path_counts import Planned, plan_paths
-from trackmdp.algos.estimates.path_gains import AlongPaths, Paths, thinned
+from trackmdp.algos.estimates.path_gains import (
+    AlongPaths,
+    KeyPlans,
+    Paths,
+    along,
+    interleaved,
+    thinned,
+)
 from trackmdp.algos.ways import Ways
-from trackmdp.arrays.entries import ones_at, per_row, row_index
+from trackmdp.arrays.entries import block_rows, ones_at, per_row
 from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.policies.table import PolicyTable, SetTable
 from trackmdp.recordings.tracks import Tracks, shuffled
 from trackmdp.seeding import derive
 from trackmdp.sensing.task import Task
 from trackmdp.solvers.exchange import exchange
-from trackmdp.solvers.plans import Plans
+from trackmdp.solvers.plans import Plans, sensed, sets_of
 
 PRIORS = (1.0, 3.0, 10.0, 30.0, 100.0)
 """Weights of the prior mean that are tried."""
@@ -97,8 +104,8 @@ def choose_plan(
     place = order[number if stage < 2 else near[first]]
     whole = Paths(task, thinned(task, tracks, _MOST, seed), discount)
     if stage == 0 and place >= len(priors):  # as it was made
-        again = _made(others[place - len(priors)], tracks, whole, plans[best].policy())
-        return _valued(whole, again)
+        make = others[place - len(priors)]
+        return _valued(whole, _made(make, tracks, whole, plans[best].policy()))
     last = _improved(whole, weights[place], rounds, plans[best])  # from the plan that was chosen
     return _searched(last) if stage == 2 else last
 
@@ -156,17 +163,17 @@ def parted(tracks: Tracks, seed: int) -> tuple[Tracks, Tracks]:
 
 def _searched(plan: Planned) -> Planned:
     """Rounds of exchange from `plan`; where one raises no reward, half as many keys change, those of largest gain."""
-    share, paths = 1.0, plan.paths
+    share, paths, found = 1.0, plan.paths, None
     followed = along(paths, plan.plans)
-    found = exchanged_keys(paths, plan.plans.table, followed, _LEAST)
     for _ in range(_ROUNDS):
+        found = found or exchanged_keys(paths, plan.plans.table, followed, _LEAST)
         if found is None:  # no key comes so often
             break
         table = found(share)
         tried = paths.follow(table)
         if tried.reward > plan.reward * (1.0 + _RISE):
             plan = replace(plan, plans=replace(plan.plans, table=table), reward=tried.reward)
-            found = exchanged_keys(paths, table, tried, _LEAST)
+            followed, found = tried, None
         elif share > _LEAST_SHARE:
             share /= 2
         else:
@@ -193,30 +200,23 @@ def exchanged_keys(
     often = np.flatnonzero(arrived >= least)
     if not len(often):
         return None
-    plans, sets = _trees(paths, followed, often), table.sets
+    plans = _trees(paths, followed, often)
     choices = [turn.choice for turn in plans.turns]
-    before = [
-        table.chosen(n, often[each.rows], each.sensors)[:, None] > 0
-        for n, each in enumerate(choices)
+    before = sets_of(choices, table, often)
+    found = exchange(plans, plans.ascend(before, sweeps=2), np.ones(len(often), dtype=bool))
+    gain = plans.worth_of(found) - plans.worth_of(before)
+    new = [
+        ones_at(*on, (len(often), paths.task.total_sensors))
+        for on in sensed(choices, found, np.arange(len(often)))
     ]
-    ascended = plans.ascend(before, sweeps=2)
-    found = exchange(plans, ascended, np.ones(len(often), dtype=bool))
-    worth, other = (plans.worth_of(each) for each in (before, found))
-    gain = other - worth
+    both = sparse.vstack([table.sets, interleaved(new)], format="csr")
 
     def changed(share: float) -> SetTable:
         few = gain < np.quantile(gain[gain > 0], 1.0 - share) if (gain > 0).any() else gain < 0
-        # The rows of these keys are replaced, those of all others stay.
-        stays = np.ones(len(paths.keys), dtype=bool)
-        stays[often[~few]] = False
-        kept = stays[row_index(sets) // len(choices)]
-        rows, sensors = [row_index(sets)[kept]], [sets.indices[kept]]
-        for n, (each, on) in enumerate(zip(choices, found, strict=True)):
-            new = on[:, 0] & ~few[each.rows]
-            rows.append(often[each.rows[new]] * len(choices) + n)
-            sensors.append(each.sensors[new])
-        after = ones_at(np.concatenate(rows), np.concatenate(sensors), sets.shape)
-        return SetTable(paths.task, after, len(paths.keys))
+        # The plans found are behind those of all keys.
+        place = np.arange(len(paths.keys))
+        place[often[~few]] = len(place) + np.flatnonzero(~few)
+        return SetTable(paths.task, both[block_rows(place, paths.task.num_choices)], len(place))
 
     return changed
 
