@@ -7,7 +7,7 @@ import torch
 
 from tests.helpers import algorithm, collect, small_world
 from trackmdp.algos.on_policy import price
-from trackmdp.policies.networks import SubsetDistribution
+from trackmdp.policies.actor_critic import SubsetDistribution
 
 
 def test_one_step_descends_the_printed_loss() -> None:

@@ -9,7 +9,7 @@ from torchrl.objectives import SoftUpdate
 
 from tests.helpers import algorithm, collect, small_world
 from trackmdp.algos.dqn import AdditiveDQNLoss, n_step
-from trackmdp.policies.networks import joint_value, make_qvalue
+from trackmdp.policies.qvalue import joint_value, make_qvalue
 
 WORLD = small_world(t_max=1)
 KEYS = ("last_cell", "steps_since_detection", "action_history")

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 import trackmdp as tm
 from tests.helpers import algorithm, collect, hop_world, small_world
 from trackmdp.algos.on_policy import price
-from trackmdp.policies.networks import SubsetDistribution
+from trackmdp.policies.actor_critic import SubsetDistribution
 
 ON_POLICY = ["a2c", "ppo"]
 GAMMA, LAMBDA, SCALE, CONSTANT = 0.8, 0.5, 0.1, 3.0

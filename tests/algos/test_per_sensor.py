@@ -20,7 +20,7 @@ from tests.algos.hindsight import (
 )
 from tests.helpers import algorithm, hop_world, small_world
 from trackmdp.config import GROUPS
-from trackmdp.config.path_learners import PerSensorConfig
+from trackmdp.config.credit import PerSensorConfig
 
 PER_SENSOR = [
     name for name, schema in GROUPS["algo"].items() if issubclass(schema, PerSensorConfig)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.helpers import algorithm, collect, small_world
-from trackmdp.policies.networks import SubsetDistribution
+from trackmdp.policies.actor_critic import SubsetDistribution
 
 ONCE = ("algo.epochs=1", "algo.minibatches=1", "algo.clip_epsilon=0.1")
 

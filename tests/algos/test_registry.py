@@ -16,7 +16,7 @@ import torch
 from tests.helpers import ALGORITHMS, algorithm, collect, small_world, train_config
 from trackmdp.app.commands.train import run
 from trackmdp.config import GROUPS
-from trackmdp.config.path_learners import PerSensorConfig
+from trackmdp.config.credit import PerSensorConfig
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers import optimal
 from trackmdp.training import checkpoint

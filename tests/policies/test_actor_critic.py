@@ -12,7 +12,7 @@ from tensordict.nn import set_interaction_type
 from tensordict.nn.probabilistic import InteractionType
 
 from tests.helpers import random_state, small_world
-from trackmdp.policies.networks import SubsetDistribution, make_actor, make_critic
+from trackmdp.policies.actor_critic import SubsetDistribution, make_actor, make_critic
 
 SUBSETS = torch.tensor(list(itertools.product([False, True], repeat=3)))
 LOGITS = torch.tensor([[-1.0, 0.3, 2.0], [0.0, -0.2, 0.1], [4.0, -5.0, 0.5]], dtype=torch.float64)

@@ -12,7 +12,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import trackmdp as tm
 from trackmdp.policies.few_sensors import FewSensors, greedy
-from trackmdp.policies.networks import EpsilonFlip
+from trackmdp.policies.qvalue import EpsilonFlip
 from trackmdp.world.model import World
 
 

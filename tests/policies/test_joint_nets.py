@@ -9,8 +9,9 @@ from torch import Tensor
 
 import trackmdp as tm
 from trackmdp.environment.env import TrackEnv
+from trackmdp.policies.actor_critic import make_actor, make_critic
 from trackmdp.policies.encoder import OverTargets, StateEncoder
-from trackmdp.policies.networks import make_actor, make_critic, make_qvalue
+from trackmdp.policies.qvalue import make_qvalue
 
 GROUP = tm.make_world("random_walk", size=3, targets=3, exit_probability=0.1, t_max=1)
 

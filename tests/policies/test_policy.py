@@ -17,8 +17,8 @@ from tests.helpers import ALGORITHMS, algorithm, random_state, small_world
 from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
 from trackmdp.policies import lookup
+from trackmdp.policies.actor_critic import SubsetDistribution
 from trackmdp.policies.forms import STATE_KEYS
-from trackmdp.policies.networks import SubsetDistribution
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.group_run import learned_policy

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from tests.helpers import random_state, small_world
-from trackmdp.policies.networks import EpsilonFlip, joint_value, make_qvalue
+from trackmdp.policies.qvalue import EpsilonFlip, joint_value, make_qvalue
 
 SUBSETS = torch.tensor(list(itertools.product([False, True], repeat=4)))
 

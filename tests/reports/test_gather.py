@@ -29,7 +29,8 @@ from trackmdp.sensing.task import Task
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.display import make_console
-from trackmdp.training.folders import locked, read_summary, run_of, write_summary
+from trackmdp.training.folders import read_summary, run_of, write_summary
+from trackmdp.training.lock import locked
 from trackmdp.training.run import load_run
 from trackmdp.world.configured import build_world
 

@@ -14,7 +14,7 @@ from trackmdp.durable import write_json, write_sealed
 from trackmdp.errors import UserError
 from trackmdp.reports import watch
 from trackmdp.reports.watch import Status, statuses
-from trackmdp.training.folders import locked
+from trackmdp.training.lock import locked
 
 HEAD = "iteration,frames,aihtr,seconds\n"
 

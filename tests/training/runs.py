@@ -13,7 +13,7 @@ import torch
 from tests.helpers import train_config
 from trackmdp.app.commands.train import run
 from trackmdp.training import checkpoint
-from trackmdp.training.callbacks import CsvLogger
+from trackmdp.training.loggers import CsvLogger
 from trackmdp.untrusted import known_object
 
 TIMED = ("seconds", "frames_per_second")

@@ -16,7 +16,7 @@ from trackmdp.app.cli import main
 from trackmdp.errors import Preempted, UserError
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.callbacks import Callback
-from trackmdp.training.folders import locked
+from trackmdp.training.lock import locked
 from trackmdp.training.state import Checkpoints
 from trackmdp.world.model import World
 

@@ -38,7 +38,7 @@ from trackmdp.errors import Preempted, RunError, UserError
 from trackmdp.signals import Watch
 from trackmdp.training import checkpoint, collect
 from trackmdp.training.callbacks import Callback, Training
-from trackmdp.training.folders import locked
+from trackmdp.training.lock import locked
 from trackmdp.training.state import _weights
 from trackmdp.world.configured import build_world
 

@@ -11,7 +11,7 @@ import pytest
 from tests.training.runs import Killed, assert_same_run, at_iteration, breaks, killed, rows, train
 from trackmdp.errors import Preempted, RunError
 from trackmdp.training import checkpoint
-from trackmdp.training.callbacks import CsvLogger
+from trackmdp.training.loggers import CsvLogger
 from trackmdp.training.state import Checkpoints
 
 KEEP = "checkpoint.keep=3"

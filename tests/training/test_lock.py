@@ -14,7 +14,7 @@ import pytest
 
 from trackmdp import durable
 from trackmdp.errors import UserError
-from trackmdp.training.folders import is_locked, locked
+from trackmdp.training.lock import is_locked, locked
 
 
 def test_a_folder_is_held_once(tmp_path: Path) -> None:

@@ -15,7 +15,8 @@ import pytest
 from trackmdp.config.compose import compose
 from trackmdp.config.logs import CsvConfig, TensorboardConfig
 from trackmdp.durable import write_json, write_text
-from trackmdp.training.callbacks import CsvLogger, Position
+from trackmdp.training.callbacks import Position
+from trackmdp.training.loggers import CsvLogger
 from trackmdp.training.result_loggers import TensorboardLogger
 
 ROW = {"iteration": 1, "frames": 256, "aihtr": 0.1 + 0.2, "loss": 1e-300, "gap": -1 / 3}

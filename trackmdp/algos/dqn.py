@@ -31,7 +31,7 @@ from trackmdp.algos.common import Averages, Checkpointed, clipped_step, set_lear
 from trackmdp.config.learning import DqnConfig
 from trackmdp.policies.few_sensors import greedy
 from trackmdp.policies.forms import STATE_KEYS
-from trackmdp.policies.networks import EpsilonFlip, joint_value, make_qvalue
+from trackmdp.policies.qvalue import EpsilonFlip, joint_value, make_qvalue
 from trackmdp.seeding import generator
 from trackmdp.sensing.task import Task
 

@@ -40,7 +40,7 @@ from trackmdp.algos.path_replay import Replay
 from trackmdp.algos.segments import InferredMoves, SegmentBuffer
 from trackmdp.arrays.entries import ones_at
 from trackmdp.arrays.types import IndexArray
-from trackmdp.config.path_learners import PerSensorConfig
+from trackmdp.config.credit import PerSensorConfig
 from trackmdp.errors import UserError
 from trackmdp.grid.displacements import displacement
 from trackmdp.policies.acting import Exploring

@@ -26,7 +26,7 @@ from trackmdp.algos.estimates.path_gains import Paths, thinned
 from trackmdp.algos.estimates.path_plans import TRIED, UNJUDGED, Maker, choose_plan
 from trackmdp.algos.estimates.shrinkage import least_worth_planning, without
 from trackmdp.algos.observed import SensedPaths, observed_paths
-from trackmdp.config.path_learners import ModelBasedConfig
+from trackmdp.config.counting import ModelBasedConfig
 from trackmdp.policies.acting import RenewedTable
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.saved import packed, unpacked_policy

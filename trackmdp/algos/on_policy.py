@@ -30,8 +30,8 @@ from trackmdp.algos.common import (
 )
 from trackmdp.config.learning import ActorCriticConfig, PpoConfig
 from trackmdp.errors import UserError
+from trackmdp.policies.actor_critic import make_actor, make_critic
 from trackmdp.policies.encoder import last_clock
-from trackmdp.policies.networks import make_actor, make_critic
 from trackmdp.seeding import generator
 from trackmdp.sensing.outcomes import Costs
 from trackmdp.sensing.task import Task

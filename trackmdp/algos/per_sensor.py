@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from trackmdp.algos.actor_loss import ActorLoss, Poisson, PolicyGradient, Surrogate
 from trackmdp.algos.hindsight import Hindsight
-from trackmdp.config.path_learners import A2cPerSensorConfig, PpoPerSensorConfig
+from trackmdp.config.credit import A2cPerSensorConfig, PpoPerSensorConfig
 from trackmdp.errors import UserError
 
 

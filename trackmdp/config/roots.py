@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from trackmdp.config import hidden_kernels, path_learners, sweeping  # noqa: F401  (more to choose from)
+from trackmdp.config import counting, credit, given, hidden_kernels, sweeping  # noqa: F401  (more to choose from)
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.by_blocks import PartitionConfig, SweptPartitionConfig
 from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig

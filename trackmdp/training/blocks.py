@@ -36,9 +36,10 @@ from trackmdp.solvers.workers import crew
 from trackmdp.training.callbacks import Learning, Position
 from trackmdp.training.display import make_console
 from trackmdp.training.evaluator import Score
-from trackmdp.training.folders import SUMMARY, finished, locked, read_summary
+from trackmdp.training.folders import SUMMARY, finished, read_summary
 from trackmdp.training.group_run import evaluator_of
 from trackmdp.training.inputs import identity, problem_of, with_own_classes, words_of, write_inputs
+from trackmdp.training.lock import locked
 from trackmdp.training.run import complete, load_run
 from trackmdp.training.trainer import Trainer
 from trackmdp.world.group import Subject, one_target

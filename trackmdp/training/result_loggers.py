@@ -20,7 +20,8 @@ from trackmdp.durable import own_folder, reopen
 from trackmdp.errors import Preempted, RunError
 from trackmdp.notebook.drawing import drawn
 from trackmdp.solvers.evaluation import figures
-from trackmdp.training.callbacks import Row, RowLogger, Training, known
+from trackmdp.training.callbacks import Row, Training
+from trackmdp.training.loggers import RowLogger, known
 from trackmdp.untrusted import reason
 from trackmdp.world.group import Group
 

@@ -23,8 +23,8 @@ from trackmdp.seeding import preserved_global_rng
 from trackmdp.training.blocks import make_trainer
 from trackmdp.training.callbacks import Callback
 from trackmdp.training.display import make_console
-from trackmdp.training.folders import locked
 from trackmdp.training.inputs import words_of
+from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
 from trackmdp.untrusted import reason
 from trackmdp.world.group import Group, Subject, check_problem, learned_in

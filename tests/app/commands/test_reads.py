@@ -12,7 +12,7 @@ from tests.helpers import BASELINES
 from tests.reads import record_reads, unread
 from trackmdp.app.prepare import Prepared
 from trackmdp.config import GROUPS, conf_dir
-from trackmdp.config.path_learners import PerSensorConfig
+from trackmdp.config.credit import PerSensorConfig
 
 SHORT = "quiet=true grid.size=3 collector.total_frames=2048 collector.frames_per_batch=1024 collector.envs=64"
 DEFAULTS = {

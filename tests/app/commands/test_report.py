@@ -16,7 +16,7 @@ from trackmdp.app.commands import report
 from trackmdp.errors import adding
 from trackmdp.reports.gather import run_folders
 from trackmdp.reports.results import Results
-from trackmdp.training.folders import is_locked
+from trackmdp.training.lock import is_locked
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,8 @@ from trackmdp.app.sweep.sweep import show_runs, write_table
 from trackmdp.durable import write_sealed
 from trackmdp.errors import Preempted, RunError
 from trackmdp.reports.gather import planned
-from trackmdp.training.folders import RunState, locked, run_of, write_plan
+from trackmdp.training.folders import RunState, run_of, write_plan
+from trackmdp.training.lock import locked
 
 __all__ = ["here"]
 

@@ -20,7 +20,7 @@ from trackmdp.reports.grouping import study
 from trackmdp.reports.page import Report, Section, build
 from trackmdp.reports.results import Results, is_stored, load_results, save_results
 from trackmdp.training.display import make_console
-from trackmdp.training.folders import locked
+from trackmdp.training.lock import locked
 from trackmdp.untrusted import printable
 
 _WAIT = 600.0

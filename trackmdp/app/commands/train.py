@@ -15,9 +15,10 @@ from trackmdp.training import notices
 from trackmdp.training.blocks import make_trainer
 from trackmdp.training.callbacks import Learning
 from trackmdp.training.display import make_console, show_held_out, table
-from trackmdp.training.folders import SUMMARY, finished, locked
+from trackmdp.training.folders import SUMMARY, finished
 from trackmdp.training.group_run import Several
 from trackmdp.training.inputs import problem_of
+from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
 from trackmdp.world.group import Subject
 

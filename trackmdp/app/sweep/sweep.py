@@ -29,10 +29,10 @@ from trackmdp.training.folders import (
     SUMMARY,
     RunState,
     finished,
-    locked,
     run_of,
     write_plan,
 )
+from trackmdp.training.lock import locked
 from trackmdp.untrusted import no_formula, reason
 
 TABLE = "runs.csv"
