@@ -8,13 +8,13 @@ probability that a target located in x is located next in j.
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import LinearOperator, bicgstab, spsolve_triangular
+from scipy.linalg.blas import daxpy
+from scipy.sparse.linalg import spsolve_triangular
 
 from trackmdp.arrays.entries import short_indices
 from trackmdp.arrays.types import Array, IndexArray
@@ -154,29 +154,52 @@ class RenewalSystem:
         return longest * float(np.abs(self.residual(gathered, solution)).max())
 
     def _iterate(self, gathered: Array, start: Array) -> Array:
-        """BiCGSTAB (van der Vorst 1992), right-preconditioned, started anew while that makes the residual much smaller.
-
-        SciPy stops by the recursive residual, which drifts off the true one.
-        """
-        best, count = np.array(start), len(start)
-        before = LinearOperator((count, count), self._precondition, dtype=np.float64)
-        left = np.abs(self.residual(gathered, best)).max()
+        """BiCGSTAB, started anew while that makes the true residual (the recursive one drifts off) much smaller."""
+        gathered, best, products = np.ascontiguousarray(gathered), np.array(start), 0
+        residual = self.residual(gathered, best)
         # Rounding alone leaves a residual of about 1e-16 times the solution; nothing is gained below the target.
-        while left > (target := self._tolerance * (np.abs(gathered).max() + np.abs(best).max())):
-            candidate, _ = bicgstab(
-                self._system,
-                gathered,
-                best,
-                rtol=0.0,
-                atol=target * math.sqrt(count),  # of the Euclidean norm
-                maxiter=_MOST_PRODUCTS // 2,
-                M=before,
-            )
-            after = np.abs(self.residual(gathered, candidate)).max()
-            if not after < 0.5 * left:  # rounding is reached
-                return best if left < after else candidate
-            best, left = candidate, after
-        return best
+        while True:
+            target = self._tolerance * float(np.abs(gathered).max() + np.abs(best).max())
+            if np.abs(residual).max() <= target or products > _MOST_PRODUCTS:
+                return best
+            candidate, spent = self._bicgstab(best, residual, target)
+            products += spent
+            after = self.residual(gathered, candidate)
+            if not np.abs(after).max() < 0.5 * np.abs(residual).max():  # rounding is reached
+                return best if np.abs(residual).max() < np.abs(after).max() else candidate
+            best, residual = candidate, after
+
+    def _bicgstab(self, start: Array, residual: Array, target: float) -> tuple[Array, int]:
+        """Van der Vorst's method, right-preconditioned; `[M]` vectors, changed in place to spare memory."""
+        # The names of van der Vorst (1992): shadow r^, direction p, image A M^-1 p, moved t = A M^-1 s.
+        shadow, residual, solution, products = residual, residual.copy(), start.copy(), 0
+        direction, image, spare = (np.zeros_like(residual) for _ in range(3))
+        rho = alpha = omega = 1.0
+
+        def dot(one: Array, other: Array) -> float:
+            # numpy's pairwise sum, the same bits for any number of BLAS threads
+            return float(np.multiply(one, other, out=spare).sum())
+
+        while products < _MOST_PRODUCTS and np.abs(residual, out=spare).max() > target:
+            correlation = dot(shadow, residual)
+            if correlation == 0 or omega == 0:  # broken down: the caller starts anew from here
+                break
+            # daxpy(x, y, a): y += a x in place. direction = residual + beta (direction - omega image)
+            daxpy(image, direction, a=-omega)
+            direction *= correlation * alpha / (rho * omega)
+            direction += residual
+            ahead = self._precondition(direction)
+            image = self._system @ ahead
+            rho, alpha = correlation, _ratio(correlation, dot(shadow, image))
+            daxpy(image, residual, a=-alpha)
+            correction = self._precondition(residual)
+            moved = self._system @ correction
+            omega = _ratio(dot(moved, residual), dot(moved, moved))
+            daxpy(ahead, solution, a=alpha)
+            daxpy(correction, solution, a=omega)
+            daxpy(moved, residual, a=-omega)
+            products += 2
+        return solution, products
 
 
 def accumulate(
@@ -204,3 +227,7 @@ def solve_onward(
         system.T if transposed else system, gathered[order], lower=transposed, unit_diagonal=True
     )
     return found
+
+
+def _ratio(part: float, whole: float) -> float:
+    return part / whole if whole else 0.0
