@@ -11,7 +11,7 @@ import pytest
 import trackmdp as tm
 from trackmdp.app.cli import main
 from trackmdp.errors import UserError
-from trackmdp.policies.export import map_features
+from trackmdp.policies.geojson import map_features
 
 ON_A_MAP = {"cell": 500.0, "origin": (8.5, 47.0), "crs": "EPSG:2056"}
 

@@ -11,7 +11,7 @@ from tests.training.runs import killed_and_resumed, rows, train
 from trackmdp.app.cli import main
 from trackmdp.config import load_run_config, to_dict, to_yaml
 from trackmdp.config.compose import compose
-from trackmdp.config.tree import continued
+from trackmdp.config.resume import continued
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.errors import UserError
 

@@ -38,7 +38,7 @@ from trackmdp.app.words import gathered, parsed, run_words
 from trackmdp.config import GROUPS, ROOTS
 from trackmdp.config.checks import build_config, validate
 from trackmdp.config.registry import maker
-from trackmdp.config.tree import key_of
+from trackmdp.config.resume import key_of
 from trackmdp.errors import UserError, message_of
 from trackmdp.signals import handled, leave
 

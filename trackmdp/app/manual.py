@@ -20,8 +20,8 @@ from trackmdp.config.checks import check_choice
 from trackmdp.config.compose import command_values, known_options
 from trackmdp.config.options import listed, several
 from trackmdp.config.registry import choice_values, load_plugins, read_values
+from trackmdp.config.resume import at_key
 from trackmdp.config.sweeping import PLUGINS
-from trackmdp.config.tree import at_key
 
 EXAMPLES = {
     "train": [

@@ -19,7 +19,7 @@ from trackmdp.config.checks import refuse_ignored
 from trackmdp.config.compose import composed_values, config_of
 from trackmdp.config.learning import file_of_classes
 from trackmdp.config.logs import require_packages
-from trackmdp.config.tree import by_key, continued, key_of, run_folder
+from trackmdp.config.resume import by_key, continued, key_of, run_folder
 from trackmdp.errors import UserError, message_of
 from trackmdp.imports import importing
 

@@ -39,12 +39,7 @@ from trackmdp.config.roots import (
     WorldConfig,
 )
 from trackmdp.config.sensors import CostConfig, FalseAlarmConfig, SensorConfig
-from trackmdp.config.tree import (
-    load_run_config,
-    to_dict,
-    to_yaml,
-    train_config_of,
-)
+from trackmdp.config.tree import load_run_config, to_dict, to_yaml, train_config_of
 from trackmdp.config.world import MEMORIES, KernelConfig
 
 load_plugins()  # at the end: they import the names above

@@ -14,7 +14,8 @@ from trackmdp.algos.estimates.alike import cell_classes
 from trackmdp.config import TrainConfig
 from trackmdp.config.checks import own_paths
 from trackmdp.config.learning import file_of_classes
-from trackmdp.config.tree import config_text, fixed_options
+from trackmdp.config.resume import fixed_options
+from trackmdp.config.tree import config_text
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.world.configured import make_problem
 from trackmdp.world.group import Group, Subject, learned_in

@@ -16,7 +16,7 @@ from tensordict.nn import (
 from trackmdp.config import GROUPS, TrainConfig, options
 from trackmdp.config.compose import compose, default, given
 from trackmdp.config.logs import require_packages
-from trackmdp.config.tree import run_folder
+from trackmdp.config.resume import run_folder
 from trackmdp.environment.observation import ObservationVector
 from trackmdp.errors import UserError, path_of
 from trackmdp.seeding import preserved_global_rng

@@ -7,7 +7,8 @@ from pathlib import Path
 import torch
 
 from trackmdp.config import ExportConfig
-from trackmdp.policies.export import checked_place, export
+from trackmdp.policies.export import export
+from trackmdp.policies.geojson import checked_place
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.solvers.value import value_of
 from trackmdp.training.display import make_console

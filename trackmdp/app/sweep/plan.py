@@ -24,8 +24,8 @@ from trackmdp.config import ROOTS, CommandConfig, TrainConfig, to_dict
 from trackmdp.config.checks import refuse_ignored
 from trackmdp.config.compose import composed_values, config_of
 from trackmdp.config.registry import unresolved
+from trackmdp.config.resume import by_key, fixed_options, key_of
 from trackmdp.config.sweeping import BlocksConfig
-from trackmdp.config.tree import by_key, fixed_options, key_of
 from trackmdp.errors import UserError
 
 _T = TypeVar("_T")

@@ -17,7 +17,7 @@ from trackmdp.app.sweep.plan import Job, progress
 from trackmdp.app.sweep.process import STOP, Launch, fail
 from trackmdp.config import TrainConfig
 from trackmdp.config.options import is_number
-from trackmdp.config.tree import by_key, continued
+from trackmdp.config.resume import by_key, continued
 from trackmdp.durable import csv_text, write_text
 from trackmdp.errors import FAILED, USER_MISTAKE, Preempted, UserError
 from trackmdp.notebook.card import counted_words, decimal
