@@ -26,7 +26,7 @@ class RowsConfig(LogConfig):
     every: int = count_option("iterations from one row to the next", unit="iterations")
 
 
-@choice("log", "csv", makes="trackmdp.training.callbacks:CsvLogger")
+@choice("log", "csv", makes="trackmdp.training.loggers:CsvLogger")
 class CsvConfig(RowsConfig):
     """`metrics.csv`, which a training always writes: without this choice a row for every iteration."""
 
