@@ -13,7 +13,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked_table, valid
 from trackmdp.solvers.certify.branch import Tree
 from trackmdp.solvers.certify.inner import InnerProblem
-from trackmdp.solvers.certify.known import adopted, tables, up_to
+from trackmdp.solvers.certify.known import adopted, first_guess, tables, up_to
 from trackmdp.solvers.exchange import exchange
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.world.model import World
@@ -66,8 +66,7 @@ def _first_set(problem: InnerProblem, mass: Array, states: IndexArray) -> BoolAr
     """`[G, 1]` the first set of the best plan from each located cell; `mass` `[E]` is undetected in `states` `[E]`."""
     world, run = problem.world, up_to(_MOST_NODES)
     known = tables(problem, slack=_SLACK, run=run)
-    plans = problem.plans(mass)
-    sets = plans.ascend(plans.none(), sweeps=10)
+    plans, sets = first_guess(problem, known, mass)
     sets = exchange(plans, sets, np.ones(world.num_cells, dtype=bool))
     # One problem per located cell: its undetected mass after the sets carried out so far.
     place = problem.turns[0].before, states

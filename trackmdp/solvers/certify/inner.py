@@ -68,8 +68,16 @@ class InnerProblem:
             for choice in [sensing(self.world, step.rows, step.states, self.world.num_cells)]
         ]
 
-    def plans(self, mass: Array | None = None) -> Plans:
-        """The plans; `mass` `[E]` is undetected before the first move, without it 1 in each located cell."""
-        detected = [self.detected[step.states] for step in self.steps]
+    def plans(self, mass: Array | None = None, credit: list[Array] | None = None) -> Plans:
+        """The plans.
+
+        Args:
+            mass: `[E]`, undetected before the first move; None: 1 in each located cell.
+            credit: for each set `[M]`, optimistic gain of locating the target in a cell over missing it.
+        """
+        steps = self.steps
+        detected = [self.detected[step.states] for step in steps]
+        if credit is not None:
+            credit = [each[step.states] for each, step in zip(credit, steps, strict=True)]
         weight = np.ones(self.world.num_cells) if mass is None else mass
-        return Plans(self.turns, weight, detected, self.missed[self.steps[-1].states])
+        return Plans(self.turns, weight, detected, self.missed[steps[-1].states], credit)

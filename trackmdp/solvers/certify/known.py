@@ -12,6 +12,20 @@ from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.solvers.certify.branch import Tree
 from trackmdp.solvers.certify.delayed import Delayed
 from trackmdp.solvers.certify.inner import InnerProblem
+from trackmdp.solvers.plans import Plans
+
+
+def first_guess(
+    problem: InnerProblem, known: list[Array], mass: Array | None = None
+) -> tuple[Plans, list[BoolArray]]:
+    """Plans, and sets found by a homotopy from the credit r + V - R, `known` being R_0 ... R_{H-1}; see `search`."""
+    # With H sets, after set t there are H - 1 - t left: credit_t(j) = r + V(j) - R_{H-1-t}(j).
+    credit = [problem.detected - known[problem.length - 1 - t] for t in range(problem.length)]
+    plans = problem.plans(mass, credit)
+    sets = plans.none()
+    for optimism in np.linspace(1.0, 0.0, 11):
+        sets = plans.ascend(sets, sweeps=3, optimism=float(optimism))
+    return plans, sets
 
 
 def tables(
@@ -34,9 +48,8 @@ def tables(
     for sets in range(len(known), problem.length):
         # R_h needs the first h steps only.
         part = replace(problem, first=0, length=sets, windowed=False)
-        plans = part.plans()
-        lower = plans.worth_of(plans.ascend(plans.none(), sweeps=10))
-        tree = Tree(part, known, lower, slack)
+        plans, found = first_guess(part, known)
+        tree = Tree(part, known, plans.worth_of(found), slack)
         run(tree)
         known.append(tree.upper())
     return known
