@@ -140,6 +140,18 @@ def test_no_run_starts_anew_where_every_checkpoint_is_damaged(
     assert files(half) == before
 
 
+def test_a_finished_run_that_cannot_go_on_keeps_its_summary(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = shutil.copytree(whole, tmp_path / "finished")
+    for file in checkpoint.available_checkpoints(folder / "checkpoints"):
+        file.write_bytes(b"")
+    before = files(folder)
+    assert typed(folder, "resume=auto", "collector.total_frames=4096") == 2
+    assert "no checkpoint to resume from" in capsys.readouterr().err
+    assert files(folder) == before
+
+
 @pytest.mark.parametrize(
     ("word", "told"),
     [

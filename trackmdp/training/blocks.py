@@ -97,6 +97,7 @@ class BlockTrainer(Learning):
             opened.enter_context(handled(stop, *HEARD))
             # Before anything is written: where there is no such cluster, no run has begun.
             run = opened.enter_context(crew(min(cfg.workers, len(parts)), cfg.cluster))
+            (place / SUMMARY).unlink(missing_ok=True)  # as in `Trainer`
             write_inputs(self.config, world, place, resumed=resumed)
             write_json(place / "plan.json", {"blocks": len(parts)})  # for `watch`
             own_folder(place / "blocks")
@@ -154,8 +155,6 @@ class _BlockLearner:
             config = self._config(number, world, folder)
             before = finished(config, folder) is not None
             if not before:
-                # One of an older config, such as a smaller budget, must not be taken for this one.
-                (folder / SUMMARY).unlink(missing_ok=True)
                 with preserved_global_rng():
                     complete(Trainer(world, config, folder=folder))
         run = load_run(folder)

@@ -25,6 +25,7 @@ from trackmdp.training.collect import make_collector
 from trackmdp.training.devices import check_memory, make_device
 from trackmdp.training.display import Display
 from trackmdp.training.evaluator import Score, while_collecting
+from trackmdp.training.folders import SUMMARY
 from trackmdp.training.group_run import evaluator_of, learned_policy
 from trackmdp.training.inputs import with_own_classes, write_inputs
 from trackmdp.training.loggers import make_loggers
@@ -139,6 +140,8 @@ class Trainer(Training):
         self.start = self._restore(state)
         self.position, self.collecting = self.start, 0.0
         if folder is not None:
+            # A summary is of an older config, such as a smaller budget: with it this run would count as done.
+            (folder / SUMMARY).unlink(missing_ok=True)
             checkpoint.remove_later(folder / "checkpoints", self.start.iteration)
             write_inputs(config, problem, folder, resumed=state is not None)
             plan = {"iterations": self.iterations, "upper_bound": self.evaluator.upper}

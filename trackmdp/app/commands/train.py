@@ -15,7 +15,7 @@ from trackmdp.training import notices
 from trackmdp.training.blocks import make_trainer
 from trackmdp.training.callbacks import Learning
 from trackmdp.training.display import make_console, show_held_out, table
-from trackmdp.training.folders import SUMMARY, finished
+from trackmdp.training.folders import finished
 from trackmdp.training.group_run import Several
 from trackmdp.training.inputs import problem_of
 from trackmdp.training.lock import locked
@@ -52,12 +52,9 @@ def run(cfg: TrainConfig, folder: Path, problem: Subject | None = None) -> float
 
 def _run(cfg: TrainConfig, folder: Path, problem: Subject | None) -> float:
     console = make_console(cfg.quiet)
-    if cfg.resume is not None:
-        if summary := finished(cfg, folder):
-            console.print(f"finished before; results in {folder}")
-            return float(summary["policy"]["aihtr"])
-        # It belongs to an older config; with it in the folder this run would count as done.
-        (folder / SUMMARY).unlink(missing_ok=True)
+    if cfg.resume is not None and (summary := finished(cfg, folder)):
+        console.print(f"finished before; results in {folder}")
+        return float(summary["policy"]["aihtr"])
     problem = problem or problem_of(cfg, folder)
     if why := notices.why_chosen(cfg, problem):
         console.print(why)
