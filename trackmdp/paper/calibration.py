@@ -83,9 +83,11 @@ class Setting(NamedTuple):
     deviation: float
 
 
-def candidates(support_size: int, seeds: Sequence[int] = SEEDS) -> list[Candidate]:
+def candidates(
+    support_size: int, *, border: Border = BORDER, t_max: int = T_MAX, seeds: Sequence[int] = SEEDS
+) -> list[Candidate]:
     """Every draw, the best first; ties go to the lower seed."""
-    accuracy = _figures(BORDER, T_MAX, support_size, seeds)[:, :, 0]
+    accuracy = _figures(border, t_max, support_size, seeds)[:, :, 0]
     deviations = _deviations(support_size, accuracy)
     rows = zip(seeds, accuracy.tolist(), deviations.tolist(), strict=True)
     return sorted((Candidate(support_size, *row) for row in rows), key=_rank)
