@@ -16,6 +16,7 @@ from tensordict.nn import TensorDictModule
 from tests.helpers import limited, small_world
 from tests.tracks import by_hand, recorded
 from trackmdp.environment import targets
+from trackmdp.environment.dynamics import Dynamics, State
 from trackmdp.environment.env import TrackEnv
 from trackmdp.motion.modes import heading_kernel
 from trackmdp.seeding import generator
@@ -105,10 +106,19 @@ def test_a_step_is_one_graph_and_the_same_step(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_every_tensor_is_made_on_the_environments_device(name: str) -> None:
+def test_every_tensor_is_made_on_the_environments_device(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With `meta`, which holds no data, as torch's default device: a tensor made without a device would be empty."""
     mine, theirs = pair(name)
     plain = stepped(theirs.step_and_maybe_reset, theirs, 20)
+    begun, start = list[torch.device](), Dynamics.start
+
+    def started(dynamics: Dynamics, place: torch.Tensor) -> State:
+        begun.append(place.device)
+        return start(dynamics, place)
+
+    monkeypatch.setattr(Dynamics, "start", started)
     with torch.device("meta"):
         env = TrackEnv(PROBLEMS[name](), 5, seed=3, device="cpu")
         env.reset()
@@ -117,6 +127,7 @@ def test_every_tensor_is_made_on_the_environments_device(name: str) -> None:
             after, rows = env.step_and_maybe_reset(rows.set("action", frame["action"]))
             assert (after == frame).all()
         env.restore(env.snapshot())
+    assert {each.type for each in begun} == {"cpu"}
 
 
 @pytest.mark.parametrize("name", ["world", "limited"])

@@ -171,7 +171,8 @@ class TrackEnv(EnvBase):
         # n takes t_max + 2 values: 0 ... t_max + 1, the last one with the safe action forced.
         values = {"last_cell": task.num_cells, "steps_since_detection": task.t_max + 2}
         values |= {"key": task.num_keys, "step_count": (task.max_steps or 0) + 1}
-        state = self._tracking.dynamics.start(torch.zeros(self._tracking.each, dtype=torch.int64))
+        place = torch.zeros(self._tracking.each, dtype=torch.int64, device=self.device)
+        state = self._tracking.dynamics.start(place)
         del state["place"]
         observed = {
             name: Categorical(values[name], torch.Size((*b, *each.shape[1:])), self.device)
