@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise, product
 from typing import TypeAlias
 
@@ -39,6 +38,8 @@ Rectangle: TypeAlias = tuple[range, range]
 
 Pairs: TypeAlias = tuple[IndexArray, IndexArray]
 """Located cells and sensors, a pair for each sensor that is on."""
+_JOBS = 64
+"""Jobs that the blocks of a grid are put into: a worker that dies loses one, and each costs a message."""
 
 
 @dataclass(frozen=True)
@@ -133,13 +134,16 @@ def plan_by_blocks(
         UserError: a policy that draws was planned.
     """
     parts = sensing_blocks(world, block, default_halo(world) if halo is None else halo)
+    ends = np.linspace(0, len(parts), min(_JOBS, len(parts)) + 1).astype(int)
 
-    def job(number: int) -> tuple[int, World, Block]:
-        # with its world: no worker needs the rest of the grid
-        return number, sub_world(world, parts[number].seen), parts[number]
+    def some(job: int) -> list[tuple[int, World, Block]]:
+        # with their worlds: no worker needs the rest of the grid
+        return [
+            (n, sub_world(world, parts[n].seen), parts[n]) for n in range(ends[job], ends[job + 1])
+        ]
 
-    planned = run(partial(_planned, plan, world.columns), Made(len(parts), job))
-    return PolicyTable.from_sensed(world, end_to_end(planned))
+    done = run(_PlanJob(plan, world.columns), Made(len(ends) - 1, some))
+    return PolicyTable.from_sensed(world, end_to_end(done))
 
 
 def narrow_halo(
@@ -156,19 +160,27 @@ def narrow_halo(
     )
 
 
-def _planned(plan: Planner, columns: int, job: tuple[int, World, Block]) -> list[Pairs]:
-    """For each n the sensed (located cells, sensors) of a block's own cells, as on the whole grid."""
-    number, world, block = job
-    table = plan(number, world)
-    table.check_fits(world)
-    if not table.deterministic:
-        raise UserError("partition.block: expected a policy that does not draw")
-    sets = table.written
-    # Row 7 of a table with two choices is cell 3 after one miss.
-    cell, n = np.divmod(row_index(sets), world.num_choices)
-    numbers, kept = cells_of(block.seen, columns), block.mine[cell]
-    on = (np.flatnonzero(kept & (n == each)) for each in range(world.num_choices))
-    return [(numbers[cell[each]], numbers[sets.indices[each]]) for each in on]
+@dataclass(frozen=True)
+class _PlanJob:
+    """Plans some blocks: for each n the sensed (located cells, sensors) of the whole grid, of their own cells alone."""
+
+    plan: Planner
+    columns: int
+
+    def __call__(self, job: Sequence[tuple[int, World, Block]]) -> list[Pairs]:
+        return end_to_end([self._block(*each) for each in job])
+
+    def _block(self, number: int, world: World, block: Block) -> list[Pairs]:
+        table = self.plan(number, world)
+        table.check_fits(world)
+        if not table.deterministic:
+            raise UserError("partition.block: expected a policy that does not draw")
+        sets = table.written
+        # Row 7 of a table with two choices is cell 3 after one miss.
+        cell, n = np.divmod(row_index(sets), world.num_choices)
+        numbers, kept = cells_of(block.seen, self.columns), block.mine[cell]
+        on = (np.flatnonzero(kept & (n == each)) for each in range(world.num_choices))
+        return [(numbers[cell[each]], numbers[sets.indices[each]]) for each in on]
 
 
 def end_to_end(parts: Sequence[Sequence[Pairs]]) -> list[Pairs]:
