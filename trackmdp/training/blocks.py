@@ -8,6 +8,7 @@ not learned again on resume, and a block that was interrupted goes on from its o
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +34,7 @@ from trackmdp.solvers.partition import (
     sensing_blocks,
 )
 from trackmdp.solvers.workers import crew
-from trackmdp.training.callbacks import Learning, Position
+from trackmdp.training.callbacks import Callback, Learning, Position
 from trackmdp.training.display import make_console
 from trackmdp.training.evaluator import Score
 from trackmdp.training.folders import SUMMARY, finished, read_summary
@@ -49,7 +50,13 @@ from trackmdp.world.problem_file import PROBLEM, problem_bytes
 
 
 def make_trainer(
-    problem: Subject, config: TrainConfig, folder: Path | None, console: Console, **own: Any
+    problem: Subject,
+    config: TrainConfig,
+    folder: Path | None,
+    console: Console,
+    *,
+    callbacks: Sequence[Callback] = (),
+    nets: Mapping[str, Any] | None = None,
 ) -> Learning:
     """The trainer of the whole grid, or of its blocks where `partition.block` is set; arguments as for `Trainer`.
 
@@ -57,9 +64,11 @@ def make_trainer(
         UserError: callbacks or networks are given for blocks, or as `Trainer` raises it.
     """
     if config.partition.block is None:
-        return Trainer(problem, config, folder=folder, console=console, **own)
-    if any(own.values()):
-        what = "callbacks" if own["callbacks"] else "actor, critic"
+        return Trainer(
+            problem, config, folder=folder, callbacks=callbacks, console=console, nets=nets
+        )
+    if callbacks or nets:
+        what = "callbacks" if callbacks else "actor, critic"
         raise UserError(
             f"{what}: expected none with partition.block, whose blocks may learn in other processes"
         )
@@ -92,14 +101,15 @@ class BlockTrainer(Learning):
         parts = sensing_blocks(world, side, halo)
         with ExitStack() as opened:
             place = self.folder or Path(opened.enter_context(TemporaryDirectory()))
-            resumed = _resumed(self.config, world, place)
+            resumed = self.folder is not None and _resumed(self.config, world, place)
             # A block handles signals while it learns; here they end the work between two blocks, and all workers.
             opened.enter_context(handled(stop, *HEARD))
             # Before anything is written: where there is no such cluster, no run has begun.
             run = opened.enter_context(crew(min(cfg.workers, len(parts)), cfg.cluster))
-            (place / SUMMARY).unlink(missing_ok=True)  # as in `Trainer`
-            write_inputs(self.config, world, place, resumed=resumed)
-            write_json(place / "plan.json", {"blocks": len(parts)})  # for `watch`
+            if self.folder is not None:
+                (place / SUMMARY).unlink(missing_ok=True)  # as in `Trainer`
+                write_inputs(self.config, world, place, resumed=resumed)
+                write_json(place / "plan.json", {"blocks": len(parts)})  # for `watch`
             own_folder(place / "blocks")
             config = with_own_classes(self.config, place) if resumed else self.config
             learner = _BlockLearner(config, place.absolute() / "blocks", parts)
