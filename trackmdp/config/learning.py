@@ -99,10 +99,13 @@ class NetworkConfig(EveryTaskConfig):
         """Two networks and their optimiser; their hidden units for each target of a batch."""
         found, targets = {"algo.hidden": networks(task, self.hidden)}, together(root)
         if targets > 1:
-            # Frames that go through the networks together.
-            rows = targets * getattr(self, "batch_size", root.collector.frames_per_batch)
+            rows = targets * self.learned_at_once(root)
             found["targets.count"] = _PASSES * rows * self.hidden * BYTES["float32"]
         return found
+
+    def learned_at_once(self, root: Any) -> int:
+        """Frames that go through the networks together."""
+        return int(root.collector.frames_per_batch)
 
 
 class ActorCriticConfig(NetworkConfig):
@@ -185,6 +188,10 @@ class DqnConfig(NetworkConfig):
             "algo.buffer_size": self.buffer_size * (transition + priority)
         }
 
+    def learned_at_once(self, root: Any) -> int:
+        """Frames that go through the networks together."""
+        return self.batch_size
+
 
 class CollectorConfig(ChoiceConfig):
     """Base of the group `collector`: where the frames come from. One frame is one env step of one environment."""
@@ -198,6 +205,11 @@ class CollectorConfig(ChoiceConfig):
         "device the environments live on", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE
     )
 
+    @property
+    def stepped(self) -> int:
+        """Environments stepped together, in all workers."""
+        return self.envs
+
     def check(self, key: str, root: Any) -> None:
         """A batch is a whole number of steps of all environments, and a run at least one batch."""
         # Where the collector has the value of the algorithm, the algorithm's option is the one to change.
@@ -207,10 +219,9 @@ class CollectorConfig(ChoiceConfig):
         )
         # A batch is `[B, time]`, B environments for equally many steps: TorchRL would round it up, and the
         # frames collected would not be those of the config.
-        stepped = self.envs * getattr(self, "workers", 1)
-        if self.frames_per_batch % stepped:
-            factors = f"{key}.envs" + (f" x {key}.workers" if stepped > self.envs else "")
-            expected = f"a multiple of {stepped} ({factors})"
+        if self.frames_per_batch % self.stepped:
+            factors = f"{key}.envs" + (f" x {key}.workers" if self.stepped > self.envs else "")
+            expected = f"a multiple of {self.stepped} ({factors})"
             raise refuse(batch, self.frames_per_batch, expected)
         if self.total_frames < self.frames_per_batch:
             expected = f"at least {batch}={self.frames_per_batch}"
@@ -234,6 +245,11 @@ class WorkersConfig(CollectorConfig):
 
     workers: int = count_option("worker processes", le=256)
     threads: int = count_option("torch threads of each worker process", unit="threads", le=256)
+
+    @property
+    def stepped(self) -> int:
+        """Environments stepped together, in all workers."""
+        return self.envs * self.workers
 
 
 @choice("collector", "multi_sync", makes="trackmdp.training.collect:multi_sync")

@@ -261,8 +261,10 @@ class _Run:
     def restart(self) -> bool:
         """Search from other starts; whether that gave a better policy, to be used next."""
         others = other_starts(self.renewal, RESTARTS)
-        self.other = best_of(self.here, others, go_on=self.budget.left).table
-        return bool(self.valued(self.other, self.value).starts.sum() > self.value.sum())
+        table = best_of(self.here, others, go_on=self.budget.left).table
+        better = bool(self.valued(table, self.value).starts.sum() > self.value.sum())
+        self.other = table if better else None
+        return better
 
     @property
     def problem(self) -> InnerProblem:

@@ -137,15 +137,20 @@ def _ask(
     # after an interruption is the one that would have come without it. Failed ones count: else they would be drawn
     # again. 2^32: NumPy takes no larger seed.
     seed = derive(cfg.seed, "optuna", over, place) % 2**32
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ExperimentalWarning)
-        # `constant_liar`: else a batch would be the same run many times.
-        tpe = TPESampler(seed=seed, constant_liar=cfg.batch > 1)
-    study.sampler = RandomSampler(seed) if cfg.sampler == "random" else tpe
+    study.sampler = _sampler(cfg, seed)
     try:
         return study.ask(searched)
     except ValueError as error:
         raise UserError(f"{_OTHER} ({error})") from error
+
+
+def _sampler(cfg: OptunaConfig, seed: int) -> Any:
+    if cfg.sampler == "random":
+        return RandomSampler(seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ExperimentalWarning)
+        # Else a batch would be the same run many times.
+        return TPESampler(seed=seed, constant_liar=cfg.batch > 1)
 
 
 def _tell(cfg: OptunaConfig, study: Any, trial: Any, job: Job) -> int:
