@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from trackmdp.config.learning import (
-    EveryTaskConfig,
-    renewed_table,
-)
+from trackmdp.config.learning import EveryTaskConfig, renewed_table
 from trackmdp.config.options import (
     BYTES,
     TABLE,

@@ -5,11 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from trackmdp.config.hidden_kernels import HiddenKernelConfig
-from trackmdp.config.options import (
-    choice,
-    count_option,
-    option,
-)
+from trackmdp.config.options import choice, count_option, option
 from trackmdp.config.sensors import SensorConfig
 from trackmdp.config.world import GridConfig
 

@@ -48,7 +48,8 @@ class PathSampler:
         states, device = motion.num_states, torch.device(device)
         self.device, self.num_states, self.modes = device, states, motion.modes
         self.starts = len(motion.first)
-        # None: all states, each a cell, and nowhere; else with the exit's entry.
+        # None where episodes start in all states, where each is a cell, and where no recording stops. The tables of
+        # cells and of ends have an entry of the exit.
         self._first = self._cells = self._ends = None
         if self.starts < states:
             self._first = torch.as_tensor(motion.first.astype(np.int64), device=device)

@@ -97,6 +97,3 @@ def make_critic(task: Task, hidden: int, targets: Sequence[int] = ()) -> ValueOp
     nn.init.zeros_(head.bias)
     network = StateNetwork(task, hidden, head, targets)
     return ValueOperator(network, in_keys=state_keys(task, targets))
-
-
-# Sensors start a little above zero: the needless ones are learned, not the needed ones.

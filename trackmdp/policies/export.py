@@ -37,7 +37,7 @@ def export(policy: Any, file: str | Path, *, value: Array | None = None, label: 
     `key_start` and `key_next` are its formulas (`KeySpace.recipe`). Where the place of the grid is known, they also
     hold `crs`, `corner`, `cell_side`, and in `cell_of` the formula of the cell of projected x and y (`Place.recipe`).
     `absent` are the numbers of sensors that do not exist.
-    `.json` holds the sets as lists (`PolicyTable.as_lists`), `.geojson` cells on a map (`trackmdp.policies.export`).
+    `.json` holds the sets as lists (`PolicyTable.as_lists`), `.geojson` cells on a map (`trackmdp.policies.geojson`).
 
     Args:
         policy: a policy, a `Run` or a `Solution`.

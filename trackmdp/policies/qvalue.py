@@ -18,6 +18,7 @@ from trackmdp.policies.forms import state_keys
 from trackmdp.sensing.task import Task
 from trackmdp.sensing.windows import Window
 
+# Sensors start a little above zero: the needless ones are learned, not the needed ones.
 _ALL_ON = 0.5
 
 

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from trackmdp.config import TrainConfig
-
 if TYPE_CHECKING:  # the display of a planner is no reason to load torch
     import torch
     from tensordict import TensorDictBase
     from torchrl.collectors import BaseCollector
 
     from trackmdp.algos.common import Algorithm
+    from trackmdp.config import TrainConfig
     from trackmdp.policies.policy import Policy
     from trackmdp.training.evaluator import Evaluator, Score
     from trackmdp.world.group import Subject

@@ -17,10 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from trackmdp.config import TrainConfig, load_run_config
-from trackmdp.durable import (
-    write_json,
-    write_sealed,
-)
+from trackmdp.durable import write_json, write_sealed
 from trackmdp.errors import UserError
 from trackmdp.training.lock import is_locked
 from trackmdp.untrusted import TIMED, decoded, known_object, opened, read_object, unsealed

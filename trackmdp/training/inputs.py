@@ -67,9 +67,8 @@ def words_of(given: Subject, folder: Path | None, subject: Subject | None = None
     problem = given.single
     for name, option in OF_TASK.items():
         value = getattr(problem, name)
-        if isinstance(
-            value, np.ndarray
-        ):  # the one number that all have, or the file of the run's arrays
+        # The one number that all have, or the file of the run's arrays.
+        if isinstance(value, np.ndarray):
             file = str((folder or Path()).absolute() / PROBLEM)
             value = float(value[0]) if (value == value[0]).all() else file
         words[option] = value

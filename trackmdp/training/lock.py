@@ -10,12 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from trackmdp.durable import (
-    UNSUPPORTED,
-    remove_parts,
-    reopen,
-    report_lacking,
-)
+from trackmdp.durable import UNSUPPORTED, remove_parts, reopen, report_lacking
 from trackmdp.errors import UserError
 from trackmdp.untrusted import opened
 
