@@ -166,7 +166,7 @@ def _changed(row: int, column: int, value: float) -> np.ndarray:
 
 
 BROKEN: dict[str, tuple[np.ndarray, str]] = {
-    "a vector": (np.ones(9), r"expected a table, got shape \(9,\)"),
+    "a vector": (np.ones(9), r"expected a square table, got shape \(9,\)"),
     "not square": (np.ones((9, 8)), r"expected a square table, got shape \(9, 8\)"),
     "another grid": (np.eye(4) / 2, "4 rows, but a 3x3 grid has 9 cells"),
     "nan": (_changed(7, 2, np.nan), "row 7 holds a value that is not finite"),

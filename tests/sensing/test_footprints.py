@@ -178,7 +178,7 @@ def test_saved_policies_keep_their_footprints(tmp_path: Path) -> None:
         ([[1, 0, 0, 0], [0, 0, 0, 0]], "sensor 1 covers no cell"),
         ([[1.5, 0, 0, 0]], "0 and 1, or probabilities"),
         ([["a"]], "not a table of numbers"),
-        (np.ones(4), "expected a table, got shape"),
+        (np.ones(4), "expected a table of 0 and 1"),
     ],
 )
 def test_what_are_no_footprints(given: object, said: str) -> None:

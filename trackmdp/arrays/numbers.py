@@ -40,7 +40,7 @@ def array_of(source: str, given: Any) -> Any:
         raise UserError(f"{source}: rows of different lengths, expected a table") from None
 
 
-def canonical(source: str, given: Any) -> sparse.csr_array:
+def canonical(source: str, given: Any, expected: str = "a table") -> sparse.csr_array:
     """A table, sparse or dense, as CSR of float64 with sorted indices, no duplicates and no explicit zeros.
 
     Raises:
@@ -51,12 +51,11 @@ def canonical(source: str, given: Any) -> sparse.csr_array:
     if table.dtype.kind not in "biuf":
         raise UserError(f"{source}: not a table of numbers (but of {table.dtype})")
     if table.ndim != 2:
-        raise UserError(f"{source}: expected a table, got shape {table.shape}")
+        raise UserError(f"{source}: expected {expected}, got shape {table.shape}")
     found = sparse.csr_array(table, dtype=np.float64, copy=True)
+    # SciPy reads outside its memory where an index is wrong.
     try:
-        found.check_format(
-            full_check=True
-        )  # SciPy reads outside its memory where an index is wrong
+        found.check_format(full_check=True)
     except ValueError as error:
         raise UserError(f"{source}: not a sparse matrix ({error})") from None
     found.sum_duplicates()

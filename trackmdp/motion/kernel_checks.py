@@ -21,9 +21,10 @@ def canonical_kernel(kernel: Any, source: str = "kernel") -> sparse.csr_array:
         UserError: it is no square table of real numbers, or its indices lead out of it; `source` is named at the start
             of the message.
     """
-    table = canonical(source, kernel)
+    expected = "a square table"
+    table = canonical(source, kernel, expected)
     if table.shape[0] != table.shape[1]:
-        raise UserError(f"{source}: expected a square table, got shape {table.shape}")
+        raise UserError(f"{source}: expected {expected}, got shape {table.shape}")
     return table
 
 

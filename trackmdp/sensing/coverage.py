@@ -52,7 +52,11 @@ class Coverage:
         """
         if given is None:
             return None
-        matrix = given.matrix if isinstance(given, Coverage) else canonical("coverage", given)
+        matrix = (
+            given.matrix
+            if isinstance(given, Coverage)
+            else canonical("coverage", given, "a table of 0 and 1")
+        )
         if not ((matrix.data > 0) & (matrix.data <= 1)).all():
             raise UserError("coverage: expected 0 and 1, or probabilities of a report")
         if matrix.shape[1] != cells or not matrix.shape[0]:
