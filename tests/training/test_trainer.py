@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import json
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import trackmdp as tm
-from tests.helpers import train_config
+from tests.helpers import small_world, train_config
 from tests.training.runs import BUDGET, QUICK, rows, train
 from trackmdp.app.commands.train import run
 from trackmdp.config import CheckpointConfig
+from trackmdp.policies.policy import Policy
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.callbacks import Callback, Position, Training
+from trackmdp.training.collect import make_collector
 from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.training.state import Checkpoints
 from trackmdp.world.configured import build_world
@@ -109,6 +113,14 @@ def test_a_budget_is_made_up_to_whole_batches(tmp_path: Path) -> None:
     """Without a word about it at the terminal: warnings are errors here."""
     train(tmp_path, "collector.total_frames=600")
     assert int(rows(tmp_path)[-1]["frames"]) == 768
+
+
+@pytest.mark.parametrize(("done", "left"), [(0, 2), (256, 1), (512, 0), (1024, 0)])
+def test_no_frames_are_left_of_a_budget_that_is_spent(done: int, left: int) -> None:
+    """On resume it may be below what was collected already."""
+    cfg, world = train_config(*QUICK[:3], *BUDGET, "collector.total_frames=384"), small_world()
+    collector = make_collector(cfg, world, Policy.none(world), torch.device("cpu"), done=done)
+    assert len(list(islice(collector, 9))) == left
 
 
 def test_a_plan_is_valued_once_and_a_net_whenever_it_is_due(

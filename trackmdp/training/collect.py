@@ -51,8 +51,8 @@ def make_collector(
     common = {
         "frames_per_batch": batch,
         # The rest, rounded up to whole batches: 100,000 frames in batches of 30,000 are 120,000, or 60,000 where
-        # 60,000 are done.
-        "total_frames": -(-(chosen.total_frames - done) // batch) * batch,
+        # 60,000 are done. To TorchRL a negative number is no limit.
+        "total_frames": max(-(-(chosen.total_frames - done) // batch), 0) * batch,
         # True would wrap the environment in an InitTracker: a transformed environment does not call the environment's
         # own `_step_and_maybe_reset`, and is slower. Left unset, TorchRL warns.
         "auto_register_policy_transforms": False,
