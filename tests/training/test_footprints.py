@@ -42,6 +42,22 @@ def test_sets_of_sensors_are_learned_and_kept(algo: str, tmp_path: Path) -> None
     assert (again.policy.dense() == run.policy.dense()).all()
 
 
+@pytest.mark.parametrize("collect", ["all_on", "mixed"])
+def test_moves_count_although_a_sensor_is_missing(collect: str) -> None:
+    """Where others cover its cells, a step with all others on is fully sensed."""
+    places = np.array([(0, 0), (0, 2), (2, 0), (2, 2), (1, 1)])
+    world = World.of(
+        small_world(),
+        small_world().kernel,
+        coverage=discs((3, 3), places, 1.5),
+        cost=[0.1, 0.2, 0.3, 0.4, np.nan],
+    )
+    few = {"updates": 4, "updates_per_iteration": 4, "hidden": 16, "batch_size": 256}
+    run = tm.train(world, "hindsight", collect=collect, **SHORT, **few)
+    assert run.columns["moves"][-1] > 0
+    assert not run.policy.dense()[..., 4].any()
+
+
 LEARNS = {
     "total_frames": 32_768,
     "updates": 300,

@@ -114,10 +114,12 @@ def sensed_moves(batch: TensorDictBase, num_cells: int) -> tuple[Tensor, Tensor]
     name, after = known_as(batch), batch["next"]
     exited = after["terminated"].squeeze(-1)
     located = (after["steps_since_detection"] == 0) | exited
-    # `every` is decided before the move, so that steps are not selected by where the target goes; with all M sensors
-    # on, a step ends located or exited.
+    # `every` is decided before the move, so that steps are not selected by where the target goes; with all sensors
+    # on that there are, a step ends located or exited.
     # The least byte of each row: on 64 x 64 cells `all` takes ten times as long, counting a hundred times.
-    every = batch["action"].view(torch.uint8).amin(-1).bool()
+    every, there = batch["action"], batch.get("action_mask")
+    every = every if there is None else every | ~there
+    every = every.view(torch.uint8).amin(-1).bool()
     whole = every & (batch["steps_since_detection"] == 0) & located
     return batch[name][whole], torch.where(exited, num_cells, after[name])[whole]
 
