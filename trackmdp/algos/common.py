@@ -18,6 +18,7 @@ from trackmdp.arrays.entries import block_rows
 from trackmdp.arrays.types import AnyArray, IndexArray
 from trackmdp.config import TrainConfig
 from trackmdp.config.registry import maker
+from trackmdp.config.tree import flatten
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.sensing.task import Task
@@ -95,7 +96,16 @@ class Checkpointed:
         return {name.strip("_"): _state(getattr(self, name)) for name in self.parts}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`."""
+        """Continue from a `state_dict`.
+
+        Raises:
+            ValueError: a floating-point tensor is of another type there; torch would convert it without a word.
+        """
+        saved_parts = flatten(state)
+        for name, part in flatten(self.state_dict()).items():
+            saved = saved_parts.get(name)
+            if isinstance(part, Tensor) and isinstance(saved, Tensor) and part.is_floating_point():
+                check_type(name, saved, part.dtype)
         for name in self.parts:
             part, saved = getattr(self, name), state[name.strip("_")]
             if isinstance(part, torch.Generator):
@@ -109,6 +119,12 @@ class Checkpointed:
                 part.load_state_dict(saved)
             else:
                 setattr(self, name, _as(part, saved))
+
+
+def check_type(name: str, saved: Tensor, *expected: torch.dtype) -> None:
+    """Raise a ValueError unless the tensor `name` of a checkpoint is of one of the types `expected`."""
+    if saved.dtype not in expected:
+        raise ValueError(f"{name}: {saved.dtype}, expected {expected[0]}")
 
 
 def _as(part: Any, saved: Any) -> Any:

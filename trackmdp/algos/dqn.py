@@ -27,8 +27,15 @@ from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 from torchrl.objectives import LossModule, SoftUpdate
 
-from trackmdp.algos.common import Averages, Checkpointed, clipped_step, set_learning_rate
+from trackmdp.algos.common import (
+    Averages,
+    Checkpointed,
+    check_type,
+    clipped_step,
+    set_learning_rate,
+)
 from trackmdp.config.learning import DqnConfig
+from trackmdp.config.tree import flatten
 from trackmdp.policies.few_sensors import greedy
 from trackmdp.policies.forms import STATE_KEYS
 from trackmdp.policies.qvalue import EpsilonFlip, joint_value, make_qvalue
@@ -149,6 +156,13 @@ class _ZeroedStorage(LazyTensorStorage):
     def _init(self, data: TensorDictBase) -> None:
         super()._init(data)
         self._storage.zero_()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue from a `state_dict`, in whose types all later transitions are stored."""
+        for name, part in flatten(state_dict).items():
+            if isinstance(part, Tensor):
+                check_type(name, part, torch.float32, torch.int64, torch.bool)
+        super().load_state_dict(state_dict)
 
 
 class DQN(Checkpointed):
