@@ -83,6 +83,16 @@ def test_a_mistake_in_every_run_is_told_once_and_leaves_nothing(
     assert not list(here.iterdir())
 
 
+@pytest.mark.parametrize("resume", ["null", "auto"])
+def test_an_option_without_effect_is_told_with_resume_as_well(
+    resume: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The words of a run in a sweep are all of its own config, also where it goes on."""
+    assert swept("seed=0,1", "algo=dqn", "algo.prioritized.alpha=0.5", f"resume={resume}") == 2
+    assert "algo.prioritized.alpha=0.5: without effect" in capsys.readouterr().err
+    assert not list(here.iterdir())
+
+
 def test_a_mistake_in_one_run_is_told_and_the_others_go_on(
     here: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -281,8 +281,7 @@ class Configs:
                 OmegaConf.update(composed, key, number)
         try:
             cfg = config_of(composed, self._root)
-            if not getattr(cfg, "resume", None):  # a run that goes on has a config of its own
-                refuse_ignored(cfg, by_key(words))
+            refuse_ignored(cfg, by_key(words))
         except UserError as error:
             return None, str(error)
         return cfg, ""
