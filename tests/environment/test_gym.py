@@ -150,6 +150,16 @@ def test_a_batch_is_that_of_the_environment(name: str) -> None:
             assert (info["final_info"]["target"][row] == 9).all() == terminated[row]
 
 
+def test_without_a_seed_episodes_are_those_of_the_generator_that_was_there() -> None:
+    """Before the first reset somebody may have looked at it, or put another in its place."""
+    starts = []
+    for seed in (1, 1, 2):
+        env = gymnasium.make(ID, world=WORLD)
+        env.unwrapped.np_random = np.random.default_rng(seed)
+        starts.append([env.reset()[1]["target"] for _ in range(12)])
+    assert starts[0] == starts[1] != starts[2]
+
+
 def test_an_unknown_option_is_a_type_error() -> None:
     with pytest.raises(TypeError, match="unexpected keyword argument 'grid_size'"):
         gymnasium.make(ID, grid_size=3)

@@ -32,7 +32,6 @@ class _Tracked:
 
     observation_space: Any
     np_random: Any
-    _np_random: Any
 
     def _make(
         self,
@@ -59,9 +58,8 @@ class _Tracked:
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """A new episode of each target; with a seed, the first one of it. There are no `options`."""
-        begun = self._np_random is not None
         super().reset(seed=seed, options=options)  # type: ignore[misc]  # of Gymnasium's own class, the next in line
-        if seed is not None or not begun:
+        if seed is not None or not self._env._tracking.state:  # the first reset
             self._env.set_seed(int(self.np_random.integers(2**31)))
         return self._seen(self._env.reset()), self._info()
 
