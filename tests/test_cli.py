@@ -285,12 +285,12 @@ def test_full_error_shows_the_traceback_of_a_mistake(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    assert main(["train", "grid.size=2"]) == 2
+    assert main(["train", "grid.size=0"]) == 2
     said = capsys.readouterr().err.splitlines()
     assert said[0].startswith("Traceback")
     assert (
         said[-1]
-        == "trackmdp train: grid.size=2: expected an integer >= 3, or a pair of them (cells)"
+        == "trackmdp train: grid.size=0: expected an integer >= 1, or a pair of them (cells)"
     )
 
 
@@ -339,9 +339,9 @@ def test_what_a_terminal_would_obey_is_spelled_out(capsys: pytest.CaptureFixture
 
 
 def test_a_mistake_typed_in_a_shell(empty_folder: Path) -> None:
-    result = typed("train", "grid.size=2")
+    result = typed("train", "grid.size=0")
     assert (result.returncode, result.stdout, result.stderr.count("\n")) == (2, "", 1)
-    assert result.stderr.startswith("trackmdp train: grid.size=2: expected")
+    assert result.stderr.startswith("trackmdp train: grid.size=0: expected")
     assert not list(empty_folder.iterdir())
 
 

@@ -149,7 +149,7 @@ def test_a_world_is_that_of_the_command_line() -> None:
 
 
 REFUSED: list[tuple[dict[str, Any], str]] = [
-    ({"size": 2}, "grid.size=2: expected"),
+    ({"size": 0}, "grid.size=0: expected"),
     ({"kernel": "lvey"}, "kernel=lvey: expected one of random_support"),
     (
         {"support_sizee": 3},

@@ -59,7 +59,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ),
     ({"sead": 1}, "sead: unknown option, did you mean seed? (known: quiet, "),
     ({"seed": "abc"}, "seed=abc: expected an integer >= 0"),
-    ({"grid.size": 2}, "grid.size=2: expected an integer >= 3"),
+    ({"grid.size": 0}, "grid.size=0: expected an integer >= 1"),
     ({"algo": "ppo", "algo.minibatches": 3}, "algo.minibatches=3: expected a divisor"),
     ({"kernel": "table"}, "kernel.path: missing, expected a path"),
     ({"kernel": "given"}, "kernel.reveals: missing, expected a problem made in Python"),

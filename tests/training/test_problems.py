@@ -73,6 +73,16 @@ def test_a_problem_from_python_is_used_by_every_command(name: str, tmp_path: Pat
     )
 
 
+@pytest.mark.parametrize("size", [(1, 1), (1, 5), (2, 2)])
+def test_what_can_be_planned_on_can_be_learned_on(size: tuple[int, int]) -> None:
+    """A road is a grid of one row; on so few cells the estimate plans as well as the motion itself."""
+    cells = size[0] * size[1]
+    world = World(np.full((cells, cells), 0.9 / cells), size, cost=0.05, t_max=1)
+    budget = {key: QUICK[key] for key in ("total_frames", "frames_per_batch", "envs", "optimal")}
+    run = tm.train(world, "model_based", **budget)
+    assert run.evaluation.aihtr == pytest.approx(tm.solve(world).upper)
+
+
 @pytest.mark.slow
 def test_a_config_stays_small_whatever_the_grid(tmp_path: Path) -> None:
     """Written as a list, the 57,600 prices took more than a config may have."""

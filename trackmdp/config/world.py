@@ -37,7 +37,7 @@ class GridConfig(NodeConfig):
     size: Any = option(
         "N, cells along each side, or [rows, columns]; M cells in all, by default with a sensor in each",
         unit="cells",
-        ge=3,
+        ge=1,
         pair=True,
     )
     t_max: int = option(

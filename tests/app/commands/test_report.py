@@ -134,7 +134,7 @@ def test_a_finished_sweep_is_watched_at_once(
 def test_a_sweep_as_typed_is_reported_with_what_failed(capsys: pytest.CaptureFixture[str]) -> None:
     words = [
         "seed=0,1",
-        "grid.size=3,2",
+        "grid.size=3,0",
         "algo=hindsight",
         "algo.updates=2",
         "algo.total_frames=2000",
@@ -145,11 +145,11 @@ def test_a_sweep_as_typed_is_reported_with_what_failed(capsys: pytest.CaptureFix
     assert main(["report", "sweep=all"]) == 0, capsys.readouterr().err
     lines = capsys.readouterr().out.splitlines()
     assert (
-        "failed: grid.size=2: expected an integer >= 3, or a pair of them (cells) and 1 more"
+        "failed: grid.size=0: expected an integer >= 1, or a pair of them (cells) and 1 more"
         in lines[0]
     )
     assert lines[1].startswith("2 runs; report in")
     page = Path("all/report/report.html").read_text(encoding="utf-8")
     assert "2 of 4 planned runs" in page
-    assert "trackmdp train -m seed=0,1 grid.size=3,2" in page
+    assert "trackmdp train -m seed=0,1 grid.size=3,0" in page
     assert str(Path.cwd()) not in page

@@ -97,12 +97,12 @@ def test_a_mistake_in_one_run_is_told_and_the_others_go_on(
     here: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     stub(monkeypatch, "train", lambda cfg, folder: 1.0)
-    assert swept("grid.size=3,2,4,1") == 2
+    assert swept("grid.size=3,0,4,-1") == 2
     assert states(here / "all") == ["done", "failed", "done", "failed"]
     captured = capfd.readouterr()
-    reason = "grid.size=2: expected an integer >= 3, or a pair of them (cells)"
+    reason = "grid.size=0: expected an integer >= 1, or a pair of them (cells)"
     said = captured.err.splitlines()
-    assert said[0].startswith("trackmdp train: size_2-")
+    assert said[0].startswith("trackmdp train: size_0-")
     assert said[0].endswith(f" failed: {reason}")
     assert said[-1] == "trackmdp train: 2 of 4 runs failed"
     assert "2 done, 2 failed; all/runs.csv" in captured.out
