@@ -8,17 +8,19 @@ import signal
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
 
-from tests.app.sweep.runs import TINY, here, started, states
+from tests.app.sweep.runs import TINY, here, started, states, swept
+from tests.typed import stub
 from trackmdp.app.sweep import process
 from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.process import stop_signal
 from trackmdp.app.sweep.sweep import sweep
 from trackmdp.config.compose import compose
-from trackmdp.errors import Preempted, UserError
+from trackmdp.errors import Preempted, RunError, UserError
 from trackmdp.training.folders import run_of
 
 __all__ = ["here"]
@@ -92,6 +94,26 @@ def test_a_run_whose_process_cannot_start_is_told_once(
     process.run_job(job)
     assert run_of(job.folder).state == "failed"
     assert capsys.readouterr().err.count("could not be started") == 1
+
+
+def test_a_run_that_cannot_leave_its_reason_is_told_in_a_line(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """On a full disk."""
+
+    def run(cfg: Any, folder: Path) -> None:
+        raise RunError("the disk is full")
+
+    def full(file: Path, content: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(file))
+
+    stub(monkeypatch, "train", run)
+    monkeypatch.setattr(process, "write_json", full)
+    assert swept("seed=0", "quiet=true") == 1
+    said = capfd.readouterr().err
+    assert "Traceback" not in said
+    assert " failed: " in said
+    assert said.endswith(f"failed.json: {os.strerror(errno.ENOSPC)}\n")
 
 
 @pytest.mark.slow

@@ -152,7 +152,12 @@ def _run_in_child(job: Job, folder: Path, connection: Connection) -> None:
     # Not by SIGTERM: where one came before, a second ends the run without saving.
     end_with_parent(lambda: os.kill(os.getpid(), signal.SIGUSR1))
     with connection:
-        sys.exit(_run(job))
+        try:
+            status = _run(job)
+        except OSError as error:  # on a full disk not even the reason can be left
+            _say(job, f"failed: {_line(error)}")
+            status = FAILED
+        sys.exit(status)
 
 
 def _run(job: Job) -> int:
