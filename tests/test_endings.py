@@ -15,6 +15,7 @@ import pytest
 from tests.typed import ENVIRONMENT, refused, stub
 from trackmdp.app import launch
 from trackmdp.app.cli import main
+from trackmdp.durable import write_json
 from trackmdp.errors import Preempted, RunError, UserError
 from trackmdp.signals import leave
 from trackmdp.solvers import optimal
@@ -197,3 +198,17 @@ def test_a_current_folder_that_was_removed_is_named(
         os.chdir(empty_folder.parent)
     (line,) = capsys.readouterr().err.splitlines()
     assert "current folder" in line
+
+
+def test_a_folder_that_is_removed_meanwhile_is_named(
+    monkeypatch: pytest.MonkeyPatch, empty_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(cfg: Any, folder: Path) -> None:
+        folder.rmdir()
+        write_json(folder / "solution.json", {})
+
+    stub(monkeypatch, "solve", run)
+    assert main(["solve", "hydra.run.dir=a"]) == 1
+    line = f"hydra.run.dir={empty_folder / 'a'}: the folder was removed while the run wrote to it"
+    assert capsys.readouterr().err == f"trackmdp solve: {line}\n"
+    assert not list(empty_folder.iterdir())

@@ -34,6 +34,7 @@ from tests.training.runs import (
 )
 from trackmdp import signals
 from trackmdp.algos.common import make_algorithm
+from trackmdp.app.prepare import Prepared
 from trackmdp.errors import Preempted, RunError, UserError
 from trackmdp.signals import Watch
 from trackmdp.training import checkpoint, collect
@@ -95,8 +96,10 @@ def test_a_disk_too_small_for_any_checkpoint(tmp_path: Path, whole: dict[str, Pa
 def test_the_folder_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "run"
     at_iteration(monkeypatch, 3, lambda: shutil.rmtree(folder))
+    folder.mkdir()
+    ready = Prepared("train", train_config(*SMALL["ppo"], *QUICK, *BUDGET), folder)
     with pytest.raises(RunError, match=f"hydra.run.dir={folder}: the folder was removed"):
-        train(folder)
+        ready.run()
     assert not folder.exists()
 
 

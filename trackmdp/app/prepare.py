@@ -20,7 +20,7 @@ from trackmdp.config.compose import composed_values, config_of
 from trackmdp.config.learning import file_of_classes
 from trackmdp.config.logs import require_packages
 from trackmdp.config.resume import by_key, continued, key_of, run_folder
-from trackmdp.errors import UserError, message_of
+from trackmdp.errors import RunError, UserError, message_of
 from trackmdp.imports import importing
 
 if TYPE_CHECKING:
@@ -45,16 +45,30 @@ class Prepared:
     problem: Subject | None = None
 
     def run(self) -> Any:
-        """Run the command; returns its result."""
+        """Run the command; returns its result.
+
+        Raises:
+            RunError: its folder was removed meanwhile, or a file could not be written.
+        """
         # Not at the top of the file: a command imports torch and TorchRL, which takes seconds, and a mistyped option
         # is refused before.
         with importing():
             run: Callable[..., Any] = importlib.import_module(
                 f"trackmdp.app.commands.{self.command}"
             ).run
-        if isinstance(self.cfg, WorldConfig):
-            return run(self.cfg, self.folder, self.problem or _problem(self.cfg, self.folder))
-        return run(self.cfg, self.folder)
+        try:
+            if isinstance(self.cfg, WorldConfig):
+                return run(self.cfg, self.folder, self.problem or _problem(self.cfg, self.folder))
+            return run(self.cfg, self.folder)
+        except OSError as error:
+            # Somebody tidied up while the run was on; "no such file" about a part of a checkpoint would puzzle.
+            if not self.folder.is_dir():
+                raise RunError(
+                    f"hydra.run.dir={self.folder}: the folder was removed while the run wrote to it"
+                ) from error
+            if error.filename and error.errno != errno.ENOENT:  # as a full disk
+                raise RunError(f"{error.filename}: {error.strerror}") from error
+            raise
 
 
 def prepare(command: str, composed: DictConfig, words: Sequence[str]) -> Prepared:

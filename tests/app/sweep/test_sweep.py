@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -124,6 +125,7 @@ ENDS: list[tuple[Callable[[], Any], str]] = [
         "iteration 3: the loss is not finite",
     ),
     (lambda: raised(Preempted(15)), "stopped by signal 15"),
+    (lambda: raised(OSError(errno.ENOSPC, "no space", "a.json")), "a.json: no space"),
     (lambda: raised(MemoryError()), "MemoryError"),
     (lambda: raised(ZeroDivisionError("a bug")), "ZeroDivisionError: a bug"),
 ]

@@ -40,11 +40,8 @@ def run(cfg: TrainConfig, folder: Path, problem: Subject | None = None) -> float
         with locked(folder):
             return _run(cfg, folder, problem)
     except OSError as error:
-        # Somebody tidied up while the run was on; "no such file" about a part of a checkpoint would puzzle.
-        if not folder.is_dir():
-            raise RunError(
-                f"hydra.run.dir={folder}: the folder was removed while the run wrote to it"
-            ) from error
+        if not folder.is_dir():  # removed meanwhile: nothing to resume
+            raise
         raise RunError(
             f"{error.filename or folder}: {error.strerror or error}; resume=auto resumes from the last checkpoint"
         ) from error
