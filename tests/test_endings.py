@@ -164,6 +164,9 @@ def test_a_full_disk_under_standard_output_is_one_line(words: str, empty_folder:
     [
         (RunError("iteration 3: the loss is not finite"), 1, "iteration 3: the loss is not finite"),
         (Preempted(signal.SIGTERM), 143, "stopped by signal 15"),
+        (MemoryError(), 1, "not enough memory"),
+        (RuntimeError("[enforce fail] can't allocate memory: 8 bytes"), 1, "not enough memory"),
+        (ImportError("libtorch_cpu.so: failed to map segment"), 1, "not enough memory"),
     ],
 )
 def test_a_run_that_breaks_down_ends_in_one_line(

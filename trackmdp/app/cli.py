@@ -29,6 +29,9 @@ COMMANDS = {
     "report": "make figures, tables and a web page of a sweep, or watch it run",
 }
 
+_NO_MEMORY = ("can't allocate memory", "failed to map segment")
+"""Words of torch, in a RuntimeError, and of the system's loader, in an ImportError."""
+
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit status: 0, or one of `trackmdp.errors`, or 128 + the signal that ended it."""
@@ -104,9 +107,7 @@ def _report(command: str, error: BaseException) -> int:
     # Without a file's name it is about no file of the user, and one of theirs that is missing is a `UserError`.
     elif isinstance(error, OSError) and error.filename and error.errno != errno.ENOENT:
         line = f"{error.filename}: {error.strerror}"
-    elif (
-        isinstance(error, MemoryError) or "can't allocate memory" in line
-    ):  # torch's words, in a RuntimeError
+    elif isinstance(error, MemoryError) or any(words in line for words in _NO_MEMORY):
         line = "not enough memory"
     else:  # a bug: its reader needs all of it
         traceback.print_exception(error)
