@@ -61,6 +61,21 @@ def test_closed_streams_are_no_mistake(words: list[str]) -> None:
     assert done.returncode == (2 if "solve" in words else 0)
 
 
+@pytest.mark.parametrize("sweep", [[], ["-m", "hydra.sweep.dir=all"]])
+def test_letters_that_a_terminal_lacks_are_no_mistake(sweep: list[str], empty_folder: Path) -> None:
+    ascii_alone = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    words = ["evaluate", "baseline=none", "grid.size=3", "episodes=5", *sweep]
+    done = subprocess.run(
+        [sys.executable, "-m", "trackmdp.app.cli", *words],
+        env=ENVIRONMENT | ascii_alone,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "simulated ? s.e." in done.stdout  # ±
+
+
 class Interrupted:
     def __set_name__(self, *_: object) -> None:
         raise KeyboardInterrupt

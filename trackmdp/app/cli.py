@@ -6,6 +6,7 @@ Nothing heavy is imported before the first line is on the terminal; a user's mis
 from __future__ import annotations
 
 import errno
+import io
 import os
 import platform
 import sys
@@ -41,6 +42,10 @@ def main(argv: list[str] | None = None) -> int:
         stream or os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
         for stream in (sys.stdout, sys.stderr)
     )
+    # A terminal that has no `±` shows `?`; by default Python raises. The variable is for processes started from here.
+    os.environ.setdefault("PYTHONIOENCODING", ":replace")
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
     # Set before TorchRL and NumPy are imported, which read them then.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reports every buffer it makes
     # Shared out to more threads, by default to all cores, sums round differently: the last digits of exact figures
