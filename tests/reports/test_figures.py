@@ -9,6 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 import pytest
 from matplotlib.figure import Figure as Canvas
@@ -211,6 +212,19 @@ def test_the_same_figure_has_the_same_bytes_and_no_date(grouped: Study, panel: P
     assert (one.svg, one.png) == (two.svg, two.png)
     assert b"date" not in one.svg.lower()
     assert one.png.startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("own", [{"text.usetex": True}, {"axes.grid": True, "savefig.dpi": 9}])
+def test_a_figure_is_drawn_without_the_settings_of_the_user(own: dict[str, Any]) -> None:
+    """A `matplotlibrc` is also read from the current folder, and may have LaTeX run on the labels."""
+
+    def drawn() -> Figure:
+        return draw_figure(EMPTY, 1.0, lambda figure: figure.add_subplot().set_xlabel("a label"))
+
+    plain = drawn()
+    with matplotlib.rc_context(own):
+        changed = drawn()
+    assert (changed.svg, changed.png) == (plain.svg, plain.png)
 
 
 def test_letters_that_the_font_lacks_stay_letters_without_a_warning() -> None:

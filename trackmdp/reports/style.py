@@ -119,7 +119,10 @@ def draw_figure(table: Table, height: float, paint: Callable[[Canvas], None]) ->
 
     svg, png = io.BytesIO(), io.BytesIO()
     # Settings and filters hold inside only: a notebook keeps its own. `Figure` without pyplot needs no display.
-    with warnings.catch_warnings(), matplotlib.rc_context(_settings(table.name)):
+    with warnings.catch_warnings(), matplotlib.rc_context():
+        # Not those of a `matplotlibrc`, also read from the current folder: it may have LaTeX run on the labels.
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_settings(table.name))
         # A name may have letters that the font lacks: text in the SVG, boxes in the PNG.
         warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
         figure = New(figsize=(WIDTH, height), dpi=160, layout="constrained")
