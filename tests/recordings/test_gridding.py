@@ -120,10 +120,11 @@ def test_a_track_is_cut_where_it_leaves_the_grid() -> None:
             (0, 15, 29.9, 20),
             (1, 0, -0.1, 5),
             (1, 5, 0, 0),
+            (1, 10, 0, 0),
         ),
         exits=False,
     )
-    assert cells(tracks) == [[5], [5], [3]]
+    assert cells(tracks) == [[5], [5], [3, 3]]
     assert tracks.exits.tolist() == [True, True, False]
     assert tracks.names.tolist() == [0, 0, 1]
     assert report["steps outside of the grid"] == 3

@@ -63,3 +63,13 @@ def test_a_projection_torn_at_180_degrees_cuts_tracks_there(
         for a, b in zip(tracks.first[:-1], tracks.first[1:], strict=True)
     ]
     assert max(jumps) <= 1
+
+
+def test_a_piece_of_one_cell_that_does_not_exit_is_no_track() -> None:
+    """It has no step; as a track its first step would be taken for an exit, which nobody has seen."""
+    table = pd.DataFrame({"id": "a", "time": [0, 100, 101, 200], "x": 0.5, "y": 0.5})
+    grid = Gridding(size=(3, 3), cell=1, shortest=1, exits=True, step=1, max_gap=5)
+    tracks, counts, _ = to_tracks(frame_positions(table), grid, "here", np.array([]))
+    assert tracks.lengths.tolist() == [2, 1]
+    assert tracks.exits.tolist() == [False, True]
+    assert counts["steps in 1 track of fewer than 2 cells"] == 1

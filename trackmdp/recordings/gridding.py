@@ -215,8 +215,9 @@ def _cut(
     # is the last of the target and the recording does not just stop.
     left = np.concatenate([same, [False]])[ends]
     lengths = ends - begins + 1
-    kept = lengths >= grid.shortest
-    exits = (left | (last[ends] & grid.exits))[kept]
+    exits = left | (last[ends] & grid.exits)
+    # A track of one cell that does not exit has no step.
+    kept = (lengths >= grid.shortest) & (exits | (lengths > 1))
     chosen = np.repeat(kept, lengths)
     first = begins[kept]
     # Steps since the first path that is kept, to the nearest one (another path may lie at any time, 10^300 s before);
@@ -227,13 +228,13 @@ def _cut(
     made = Tracks(
         cells[inside][chosen],
         ends_of(lengths[kept]),
-        exits,
+        exits[kept],
         flat.track[place[first]],
         clock + within,
     )
     counts = {
         _OUTSIDE: int((~inside).sum()),
-        f"steps in {counted_words(int((~kept).sum()), 'track')} of fewer than {grid.shortest} cells": int(
+        f"steps in {counted_words(int((~kept).sum()), 'track')} of fewer than {max(grid.shortest, 2)} cells": int(
             lengths[~kept].sum()
         ),
         "steps kept": len(made.cells),
