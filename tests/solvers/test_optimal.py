@@ -29,6 +29,7 @@ from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found
 from trackmdp.solvers.solution import SearchProgress
+from trackmdp.solvers.solve import solve
 from trackmdp.world.model import World
 
 
@@ -192,6 +193,18 @@ def test_numeric_edges(name: str, shape: str) -> None:
     assert (solution.value <= bounds.clocked(world) + 1e-8 * scale).all()
     assert (bounds.clocked(world) <= bounds.valid(world) + 1e-8 * scale).all()
     np.testing.assert_array_equal(solution.table.dense(), optimal.solve(world).table.dense())
+
+
+@pytest.mark.parametrize("solver", ["optimal", "clocked"])
+@pytest.mark.parametrize("unit", [1e-9, 1e-3, 1e3])
+def test_the_unit_of_rewards_and_prices_certifies_nothing(solver: str, unit: float) -> None:
+    """In thousandths all figures are a thousandth: so is a gap that counts as closed."""
+    world = paper_world(4, 0.2, 1, size=5).but(detection=0.8)
+    units = {"reward": unit, "cost": unit * world.cost, "safe_cost": unit * world.safe_cost}
+    here, there = solve(world, solver), solve(world.but(**units), solver)
+    assert there.certified == here.certified == (solver == "optimal")
+    assert there.lower == pytest.approx(unit * here.lower, rel=1e-6)
+    assert there.upper == pytest.approx(unit * here.upper, rel=1e-6)
 
 
 def test_a_larger_grid_is_certified() -> None:

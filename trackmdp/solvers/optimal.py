@@ -34,7 +34,7 @@ from trackmdp.solvers.regions import improved, proved, region_side
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.rules import clocked_policy
 from trackmdp.solvers.search import Found, clocked_sets, follow_credit
-from trackmdp.solvers.solution import SearchProgress, Solution
+from trackmdp.solvers.solution import SearchProgress, Solution, unit
 from trackmdp.solvers.value import value_of
 from trackmdp.world.model import World
 
@@ -165,7 +165,7 @@ class _Run:
 
     @property
     def gap_allowed(self) -> float:
-        return max(self.tolerance, ROUNDING) * max(1.0, abs(float(self.value.mean())))
+        return max(self.tolerance, ROUNDING) * unit(self.world, float(self.value.mean()))
 
     @property
     def slack(self) -> float:

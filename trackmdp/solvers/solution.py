@@ -117,6 +117,14 @@ class SearchProgress:
         return line if self.left is None else f"{line}  {self.stage}, {self.left:.0f} s left"
 
 
+def unit(world: World, value: float) -> float:
+    """What a bracket around `value` is measured by: the value itself, or the reward of a detection where that is more.
+
+    Both change with the unit of rewards and prices, so that what counts as closed does not.
+    """
+    return max(world.reward, abs(value))
+
+
 def bracketed(
     world: World,
     table: PolicyTable,
@@ -128,5 +136,5 @@ def bracketed(
     evaluation = value_of(world, table)
     bound = np.maximum(clocked(world) if bound is None else bound, evaluation.value)
     gap = float((bound - evaluation.value).mean()) + evaluation.error
-    certified = gap <= tolerance * max(1.0, abs(evaluation.aihtr))
+    certified = gap <= tolerance * unit(world, evaluation.aihtr)
     return Solution(table, evaluation, bound, certified, seconds, nodes=0, interrupted=False)
