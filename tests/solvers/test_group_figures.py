@@ -39,3 +39,18 @@ def test_a_difference_is_corrected_by_the_steps_of_the_targets() -> None:
     assert found.low is not None
     assert found.high is not None
     assert found.low < 10.0 < found.high < found.low + 0.02
+
+
+def test_a_single_episode_that_differs_says_one_thing() -> None:
+    """Steps and known rewards then differ together: only one of the two can explain the reward."""
+    for other in np.linspace(1.0, 19.0, 200):
+        totals = np.zeros((64, 7))
+        totals[:, 0] = np.arange(64) / 64
+        totals[:, [1, 6]] = 20.0, 20.263729627154635
+        totals[0, [1, 6]] = other, 1.0131864830135174 * (other + 1.0)
+        means = totals[:, [1, 6]].mean(axis=0)
+        found = GroupEvaluation(totals, False, 20.0, tuple(means + 1e-3)).aihtr
+        assert found.low is not None
+        assert found.high is not None
+        assert found.mean == pytest.approx(totals[:, 0].mean(), abs=0.02)
+        assert 0.05 < found.high - found.mean < 0.1

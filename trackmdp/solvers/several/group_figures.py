@@ -58,10 +58,12 @@ class GroupEvaluation(Carded):
             return ratio(reward, np.ones(count))
         shown = self.totals[:, [1, 6]].mean(axis=0)
         columns, apart = self.totals[:, [1, 6]] - shown, shown - self.controls
-        slope = np.linalg.lstsq(columns, reward, rcond=None)[0]
+        # Figures that are the same but for rounding count once.
+        inverse = np.linalg.pinv(columns, rcond=1e-10)
+        slope = inverse @ reward
         mean = float(reward.mean() - apart @ slope)
         rest, freedom = reward - reward.mean() - columns @ slope, count - _FREE
-        share = 1.0 / count + float(apart @ np.linalg.pinv(columns.T @ columns) @ apart)
+        share = 1.0 / count + float(((apart @ inverse) ** 2).sum())
         half = student(freedom) * math.sqrt(float((rest**2).sum()) / freedom * share)
         return MeanInterval(mean, mean - half, mean + half, count)
 
