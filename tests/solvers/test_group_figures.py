@@ -54,3 +54,14 @@ def test_a_single_episode_that_differs_says_one_thing() -> None:
         assert found.high is not None
         assert found.mean == pytest.approx(totals[:, 0].mean(), abs=0.02)
         assert 0.05 < found.high - found.mean < 0.1
+
+
+def test_what_no_episode_has_shown_may_happen_all_the_same() -> None:
+    """As of single targets: 40 episodes without a miss and without a safe action do not rule them out."""
+    totals = np.tile([4.0, 5.0, 5.0, 9.0, 0.0, 6.0, 4.0], (40, 1))
+    found = GroupEvaluation(totals, False, 6.0, None)
+    assert (found.accuracy.mean, found.safe_per_step.mean) == (1.0, 0.0)
+    assert found.safe_per_step.low == 0.0
+    assert found.safe_per_step.high == pytest.approx((1 - 0.025 ** (1 / 40)) / 6)
+    assert found.accuracy.low == pytest.approx(1 - (1 - 0.025 ** (1 / 40)) / 5)
+    assert found.accuracy.high == 1.0

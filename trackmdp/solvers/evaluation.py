@@ -157,14 +157,14 @@ class ReplayedTracks:
         return {
             "aihtr": ratio(reward, tracks),
             "reward_per_step": ratio(reward, length),
-            "accuracy": _complement(ratio(steps - detections, steps, events=True)),
+            "accuracy": complement(ratio(steps - detections, steps, events=True)),
             "sensors_per_step": ratio(sensors, steps),
             "safe_per_episode": ratio(safe, tracks, events=True),
             "expected_length": ratio(length, tracks),
         }
 
 
-def _complement(missed: MeanInterval) -> MeanInterval:
+def complement(missed: MeanInterval) -> MeanInterval:
     """1 less a share, with its interval."""
     low, high = (None if end is None else 1.0 - end for end in (missed.high, missed.low))
     return MeanInterval(1.0 - missed.mean, None if low is None else max(low, 0.0), high, missed.n)

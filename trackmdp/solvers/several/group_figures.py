@@ -11,6 +11,7 @@ import numpy as np
 
 from trackmdp.arrays.types import Array
 from trackmdp.notebook.card import Card, Carded, counted_words, decimal
+from trackmdp.solvers.evaluation import complement
 from trackmdp.statistics import MeanInterval, ratio, student
 
 FIGURES = ("aihtr", "reward_per_step", "accuracy", "sensors_per_step", "safe_per_step")
@@ -37,12 +38,12 @@ class GroupEvaluation(Carded):
     expected_length: float
     controls: tuple[float, float] | None
 
-    def _ratio(self, part: int, whole: int) -> MeanInterval:
+    def _ratio(self, part: int, whole: int, *, events: bool = False) -> MeanInterval:
         if self.exact:
             some, every = self.totals[0, [part, whole]].tolist()
             value = some / every if every else math.nan
             return MeanInterval(value, value, value, 1)
-        return ratio(self.totals[:, part], self.totals[:, whole])
+        return ratio(self.totals[:, part], self.totals[:, whole], events=events)
 
     @cached_property
     def aihtr(self) -> MeanInterval:
@@ -79,7 +80,10 @@ class GroupEvaluation(Carded):
     @property
     def accuracy(self) -> MeanInterval:
         """Detections per step of a target in the grid."""
-        return self._ratio(2, 1)
+        if self.exact:
+            return self._ratio(2, 1)
+        steps, detections = self.totals[:, 1], self.totals[:, 2]
+        return complement(ratio(steps - detections, steps, events=True))
 
     @property
     def sensors_per_step(self) -> MeanInterval:
@@ -89,7 +93,7 @@ class GroupEvaluation(Carded):
     @property
     def safe_per_step(self) -> MeanInterval:
         """Safe actions per step."""
-        return self._ratio(4, 5)
+        return self._ratio(4, 5, events=True)
 
     def less(self, other: GroupEvaluation) -> GroupEvaluation:
         """The differences of all totals to those of another policy for the same targets, whose steps are kept."""
