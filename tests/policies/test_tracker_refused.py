@@ -16,6 +16,7 @@ from trackmdp.policies.policy import Policy
 MISTAKES: dict[str, tuple[Any, str]] = {
     "second report": (lambda t: (t.report(0), t.report(0)), r"report: no sensors\(\) since"),
     "outside": (lambda t: t.report(9), "report: cell=9: expected an integer from 0 to 8"),
+    "text": (lambda t: t.report("5"), "report: cell='5': expected an integer from 0 to 8"),
     "seen outside": (lambda t: t.sees(9), "sees: cell=9: expected an integer from 0 to 8"),
     "no cell": (lambda t: t.report(False), "report: cell=False: expected"),
     "fraction": (lambda t: t.report(0.5), "report: cell=0.5: expected"),

@@ -106,5 +106,7 @@ def whole_number(name: str, value: Any, lowest: int, most: float = math.inf) -> 
         number = None
     if number is None or not lowest <= number <= most:
         expected = f">= {lowest}" if most == math.inf else f"from {lowest} to {most:,}"
-        raise UserError(f"{name}={value}: expected an integer {expected}")
+        # Quoted, as "5" may be one that a table of texts held.
+        shown = repr(value) if isinstance(value, str) else value
+        raise UserError(f"{name}={shown}: expected an integer {expected}")
     return number
