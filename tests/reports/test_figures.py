@@ -104,6 +104,10 @@ def test_learned_policies_lie_over_the_frontier_of_the_solved_ones() -> None:
     alone = swept_figure(unsolved, priced)
     assert alone
     assert "line: " not in alone.table.caption
+    assert alone.table.caption.endswith("; n = 2 seeds")
+    once = study([each for each in runs if each.seed == 0])
+    for figure in (swept_figure(once, priced), figures.against_price(once, priced, "aihtr", None)):
+        assert figure and figure.table.caption.endswith("; n = 1 seed")
 
 
 def test_exact_lines_stand_at_the_true_price_and_learned_ones_beside_it(

@@ -12,6 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from trackmdp.arrays.types import Array
+from trackmdp.notebook.card import counted_words
 from trackmdp.reports.grouping import Study
 from trackmdp.reports.style import (
     INK,
@@ -103,10 +104,11 @@ def _line_figure(
     return draw_figure(Table(name, title, columns, rows), 3.4, paint)
 
 
-def _count(lines: Sequence[Line]) -> str:
-    """The number of runs of an estimate: ``n = 3``, or ``n = 2–5``."""
+def _count(lines: Sequence[Line], unit: str) -> str:
+    """The number of runs of an estimate: ``n = 1 seed``, ``n = 3 seeds``, or ``n = 2–5 seeds``."""
     counts = sorted({each.n for line in lines for each in line.row if each.n})
-    return f"n = {'–'.join(map(str, dict.fromkeys((counts[0], counts[-1]))))}"
+    fewest = "" if counts[0] == counts[-1] else f"{counts[0]}–"
+    return f"n = {fewest}{counted_words(counts[-1], unit)}"
 
 
 Panel: TypeAlias = tuple[str, dict[float, str]]
@@ -181,7 +183,7 @@ def against_price(study: Study, panel: Panel, key: str, threshold: float | None)
     column = QUANTITIES[key]
     return _line_figure(
         f"{key.replace('_', '-')}-{slug(title)}",
-        f"{column.label[0].upper()}{column.label[1:]} by the price of a sensor, {title}; {_count(learned)} seeds",
+        f"{column.label[0].upper()}{column.label[1:]} by the price of a sensor, {title}; {_count(learned, 'seed')}",
         [*learned, *others],
         (Column("c, price of a sensor for one step"), column),
         finish,
@@ -215,7 +217,7 @@ def learning(study: Study, by: str) -> Figure | None:
     ]
     if not lines:
         return None
-    title = f"Regret while learning: mean over worlds and seeds with 95 % interval; {_count(lines)} runs"
+    title = f"Regret while learning: mean over worlds and seeds with 95 % interval; {_count(lines, 'run')}"
     heads = (Column(("env steps", "seconds of learning")[place], 1), QUANTITIES["regret"])
 
     def finish(axes: Axes) -> None:
@@ -293,6 +295,6 @@ def profiles(study: Study, threshold: float | None) -> Figure | None:
         if threshold is not None:
             axes.axvline(threshold, color=INK, linewidth=0.6, linestyle=":")
 
-    title = f"Share of runs with a regret per step of at most τ, with 95 % interval; {_count(lines)} runs"
+    title = f"Share of runs with a regret per step of at most τ, with 95 % interval; {_count(lines, 'run')}"
     heads = (Column("τ, regret per step", 5), Column("share of runs", 2))
     return _line_figure("profiles", title, lines, heads, finish, thin=12)

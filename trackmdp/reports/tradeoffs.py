@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from trackmdp.notebook.card import counted_words
 from trackmdp.reports.figures import Panel, slug
 from trackmdp.reports.grouping import Study
 from trackmdp.reports.style import (
@@ -116,9 +117,8 @@ def swept_figure(study: Study, panel: Panel) -> Figure | None:
         rows += [[method, *each, None, n] for each, n in zip(places, seeds, strict=True)]
         counts += seeds
     line = f"; line: mixtures of two policies, {name}" if best else ""  # none on recordings
-    caption = (
-        f"Accuracy against sensors per step at all prices, {title}{line}; n = {max(counts)} seeds"
-    )
+    most = counted_words(max(counts), "seed")
+    caption = f"Accuracy against sensors per step at all prices, {title}{line}; n = {most}"
     columns = [Column("policy"), Column("c"), Column("sensors per step", 3)]
     columns += [Column("accuracy", 4), Column("on the line"), Column("n")]
     table = Table(f"frontier-{slug(title)}", caption, columns, rows)
