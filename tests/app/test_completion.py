@@ -30,6 +30,7 @@ def script(capsys: pytest.CaptureFixture[str]) -> str:
         ("trackmdp ", {f"{name} " for name in COMMANDS}, set()),
         ("trackmdp train algo=", {"algo=ppo", "algo=hindsight"}, {"algo=base_ppo"}),
         ("trackmdp train algo=pp", {"algo=ppo", "algo=ppo_per_sensor"}, {"algo=dqn"}),
+        ("trackmdp train kernel=", {"kernel=drift", "kernel=tracks"}, {"kernel=given"}),
         ("trackmdp evaluate grid.t", {"grid.t_max="}, {"grid.size="}),
     ],
 )

@@ -137,7 +137,7 @@ def test_a_new_sensor_and_a_new_memory_work_in_every_command(
 
 def test_its_options_are_checked(site: Path, tmp_path: Path) -> None:
     kernels = "random_support, random_walk, drift, table, tracks, heading, regimes"
-    kernels += ", constant_velocity, coordinated_turn, given"
+    kernels += ", constant_velocity, coordinated_turn"
     refused = {
         f"{TRAIN} algo.naps=10": "algo.naps=10: expected an integer from 0 to 9 (naps)",
         f"{TRAIN} algo.naps=5 algo.envs=4": "algo.naps=5: expected at most collector.envs=4",

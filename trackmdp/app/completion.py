@@ -14,9 +14,10 @@ _trackmdp() {
         mapfile -t COMPREPLY < <(compgen -S ' ' -W '%(commands)s' -- "$word")
         return
     fi
-    # The program reads a line without the command; choices that begin with base_ are parts of others.
+    # The program reads a line without the command; choices that begin with base_ are parts of others, and given
+    # stands for a problem made in Python.
     choices=$(COMP_LINE="${COMP_WORDS[0]} ${COMP_LINE#*" $command"}" \\
-        "${COMP_WORDS[0]}" "$command" -sc query=bash 2>/dev/null | tr ' ' '\\n' | grep -v '=base_')
+        "${COMP_WORDS[0]}" "$command" -sc query=bash 2>/dev/null | tr ' ' '\\n' | grep -v -e '=base_' -e '=given$')
     mapfile -t COMPREPLY < <(compgen -W "$choices" -- "$word")
 }
 COMP_WORDBREAKS=${COMP_WORDBREAKS//=}

@@ -18,7 +18,7 @@ from omegaconf import MISSING
 from trackmdp.config import GROUPS, ROOTS, Option, options
 from trackmdp.config.checks import check_choice
 from trackmdp.config.compose import command_values, known_options
-from trackmdp.config.options import listed, several
+from trackmdp.config.options import listed, several, typed_choices
 from trackmdp.config.registry import choice_values, load_plugins, read_values
 from trackmdp.config.resume import at_key
 from trackmdp.config.sweeping import PLUGINS
@@ -143,9 +143,7 @@ def _offered(group: str, values: dict[str, Any]) -> str:
     default = "none chosen"
     if (node := values[group]) is not None:
         default = node["name"] if "name" in node else listed(node)
-    # `given` stands for a problem made in Python, and cannot be typed.
-    names = [name for name in GROUPS[group] if name != "given"]
-    return f"{group}={'|'.join(names)} (default: {default})"
+    return f"{group}={'|'.join(typed_choices(group))} (default: {default})"
 
 
 def _all(command: str, values: dict[str, Any]) -> Iterator[str]:

@@ -24,6 +24,7 @@ from trackmdp.config.options import (
     nodes,
     options,
     refuse,
+    typed_choices,
 )
 from trackmdp.errors import UserError
 
@@ -115,7 +116,7 @@ def check_choice(group: str, name: Any) -> None:
     if group in _VALUES and name is not None and is_number(str(name)):
         raise UserError(f"{group}={name}: expected {_VALUES[group]}={name}")
     none = ", or log=[] for none" if group == "log" and name is None else ""
-    raise refuse(group, name, f"one of {', '.join(GROUPS[group])}{none}")
+    raise refuse(group, name, f"one of {', '.join(typed_choices(group))}{none}")
 
 
 def validate(cfg: _T, place: str = "", root: Any = None, *, rules: bool = True) -> _T:

@@ -174,6 +174,11 @@ GROUPS: dict[str, dict[str, type[Any]]] = {}
 """Group -> choice -> its schema, for example ``GROUPS["kernel"]["drift"]``."""
 
 
+def typed_choices(group: str) -> list[str]:
+    """The choices of a group but `given`, which stands for a problem made in Python and cannot be typed."""
+    return [name for name in GROUPS[group] if name != "given"]
+
+
 @dataclass(frozen=True)
 class Node:
     """A nested config.
