@@ -57,7 +57,7 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
     ("words", "message"),
     [
         ("train grid.sise=5", "grid.sise: unknown option, did you mean grid.size?"),
-        ("train +sead=5", "sead: unknown key, did you mean seed?"),
+        ("train +sead=5", "sead: unknown option, did you mean seed?"),
         ("train grid=5", "grid=5: expected grid.size=value"),
         ("train ~grid.size", "~grid.size: expected grid.size=value, without + or ~"),
         ("train size", "size: expected option=value"),
@@ -150,11 +150,11 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         ),
         (
             "train +algo._target_=os.system",
-            "algo._target_: unknown key",
+            "algo._target_: unknown option",
         ),
         (
             "train -m seed=0,1 ++hydra.sweeper._target_=os.system",
-            "hydra.sweeper._target_: unknown key",
+            "hydra.sweeper._target_: unknown option",
         ),
         (
             "train +hydra.callbacks.x._target_=os.getcwd",

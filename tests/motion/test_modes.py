@@ -225,11 +225,11 @@ def test_regimes_are_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         ),
         (
             "kernel.regimes=[{kernel: drift}, {kernel: drift, way: 3}]",
-            r"kernel\.regimes\[1\]\.way: unknown key.*\(known: .*direction",
+            r"kernel\.regimes\[1\]\.way: unknown option.*\(known: .*direction",
         ),
         (
             "kernel.regimes=[{kernel: drift}, {kernel: drift, direction: 400}]",
-            r"kernel\.regimes\[1\]\.direction=400\.0: expected a number >= 0 and < 360 \(degrees\)",
+            r"kernel\.regimes\[1\]\.direction=400: expected a number >= 0 and < 360 \(degrees\)",
         ),
         (
             "kernel.regimes=[{kernel: drift}, {kernel: table}]",

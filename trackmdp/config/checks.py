@@ -159,7 +159,7 @@ def build_config(plain: Any, schema: type[_T], prefix: str = "") -> _T:
     # Unknown keys first: a misspelt key is missing as well, and this message has the right one.
     for key in plain:
         if key not in known:
-            raise UserError(f"{prefix}{key}: unknown key{suggestion(str(key), known)}")
+            raise UserError(f"{prefix}{key}: unknown option{suggestion(str(key), known)}")
     for key in known:
         if key not in plain:
             raise UserError(f"{prefix}{key}: missing")

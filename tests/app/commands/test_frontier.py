@@ -138,8 +138,8 @@ def test_an_accuracy_that_no_policy_has_is_refused_after_the_files_are_written(
     [
         ("accuracy=1.5", "accuracy=1.5: expected a number from 0 to 1"),
         ("accuracy=much", "accuracy=much: expected"),
-        ("sensors=-1", "sensors=-1.0: expected a number >= 0"),
-        ("resolution=0", "resolution=0.0: expected a number > 0"),
+        ("sensors=-1", "sensors=-1: expected a number >= 0"),
+        ("resolution=0", "resolution=0: expected a number > 0"),
         ("acuracy=0.9", "acuracy: unknown option, did you mean accuracy?"),
         ("solver=qmpd", "solver=qmpd: expected one of"),
         ("grid.max_steps=9", "grid.max_steps=9: expected null"),

@@ -38,8 +38,8 @@ NEEDS_THE_MODEL = sorted(set(GROUPS["baseline"]) - {"all_on", "none", "random_k"
             "kernel.held_out=0.9",
             "kernel.held_out=0.9, kernel.validation=0.1: leave, of 60 tracks, none to learn from",
         ),
-        ("train", "kernel.validation=1", "kernel.validation=1.0: expected a number > 0 and < 1"),
-        ("train", "kernel.held_out=0", "kernel.held_out=0.0: expected a number > 0 and < 1"),
+        ("train", "kernel.validation=1", "kernel.validation=1: expected a number > 0 and < 1"),
+        ("train", "kernel.held_out=0", "kernel.held_out=0: expected a number > 0 and < 1"),
         ("train", "kernel.path=no.csv", "kernel.path="),
         (
             "train",
