@@ -128,6 +128,8 @@ def test_overview_and_unknown_commands(capsys: pytest.CaptureFixture[str]) -> No
     assert capsys.readouterr().err.startswith(
         "trackmdp: unknown command 'trian': expected one of train, "
     )
+    assert main(["exampel"]) == 2
+    assert "report, example" in capsys.readouterr().err
 
 
 def test_help_and_first_line_import_nothing_heavy() -> None:

@@ -82,7 +82,9 @@ def _dispatch(words: list[str]) -> int:
             sys.stdout.write(_example(words[1:]))
             return 0
         if command not in COMMANDS:
-            raise UserError(f"unknown command {command!r}: expected one of {', '.join(COMMANDS)}")
+            raise UserError(
+                f"unknown command {command!r}: expected one of {', '.join([*COMMANDS, 'example'])}"
+            )
         # Runs lock their folders and hear signals as POSIX has them; better here than in the middle of an import.
         if platform.system() == "Windows":
             raise UserError(
