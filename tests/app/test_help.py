@@ -91,6 +91,12 @@ def test_help_of_a_choice_shows_what_it_reads(
     assert refused(capsys, "train", "algo=sac", "--help").startswith("algo=sac: expected one of ")
 
 
+def test_help_of_another_word_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    for word in ("alll", "kernel", "drift"):
+        told = refused(capsys, "train", "--help", word)
+        assert told == f"--help {word}: expected all, group=choice or option=value"
+
+
 def test_examples_of_the_help_can_be_typed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -152,7 +152,7 @@ def _run(command: str, words: list[str]) -> int:
         from trackmdp.app.manual import manual
 
         try:
-            text = manual(command, [word for word in words if not word.startswith("-")])
+            text = manual(command, _asked(words))
         except UserError as error:
             if not any(word.startswith(("--config-dir", "-cd")) for word in words):
                 raise
@@ -164,6 +164,16 @@ def _run(command: str, words: list[str]) -> int:
         from trackmdp.app.launch import launch
 
     return launch(command, words)
+
+
+def _asked(words: list[str]) -> list[str]:
+    """The words of a line that help is about: neither flags nor the value of one, as the folder of `--config-dir`."""
+    alone = ("-h", "--help", "-m", "--multirun")
+    return [
+        word
+        for before, word in zip(["", *words], words, strict=False)
+        if not word.startswith("-") and ("=" in word or before in alone or before[:1] != "-")
+    ]
 
 
 def _example(names: list[str]) -> str:

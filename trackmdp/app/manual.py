@@ -22,6 +22,7 @@ from trackmdp.config.options import listed, several, typed_choices
 from trackmdp.config.registry import choice_values, load_plugins, read_values
 from trackmdp.config.resume import at_key
 from trackmdp.config.sweeping import PLUGINS
+from trackmdp.errors import UserError
 
 EXAMPLES = {
     "train": [
@@ -89,8 +90,11 @@ def manual(command: str, words: Sequence[str] = ()) -> str:
             options are shown.
 
     Raises:
-        UserError: a choice is unknown.
+        UserError: a choice is unknown, or a word is neither ``all`` nor like ``algo=ppo``.
     """
+    for word in words:
+        if word != "all" and "=" not in word:
+            raise UserError(f"--help {word}: expected all, group=choice or option=value")
     # Installed packages add choices, which are listed like our own.
     load_plugins()
     typed = _choices(command, words)
