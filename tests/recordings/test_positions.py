@@ -186,6 +186,8 @@ BOMB = '<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;&a;">]>'
 
 DAMAGED = {
     "no columns": ("points", "a,b\n1,2\n", "columns a, b: expected id (mmsi, icao24,"),
+    "semicolons": ("points", "id;t;x;y\n", "'id;t;x;y': expected commas between columns"),
+    "tabs": ("points", "id\tt\tx\ty\n", "expected commas between columns"),
     "both": ("points", "id,t,x,y,lat,lon\n", "expected either x, y or lat, lon"),
     "half": ("points", "id,t,x,lon\n", "expected either x, y or lat, lon"),
     "word": (

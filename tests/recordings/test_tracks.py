@@ -97,6 +97,10 @@ def test_a_file_that_has_changed_is_read_again(tmp_path: Path) -> None:
         ("track,cell\n0,one\n", "not a table of numbers"),
         ("track,cell\nv0,1\nv0,one\n", "not a table of numbers (could not convert string 'one'"),
         ("track,cell\nv0,1\n,1\n", "not a table of numbers (could not convert string ''"),
+        (
+            "track;cell\n0;1\n",
+            "not a table of numbers ('track;cell': expected commas between columns)",
+        ),
         ("track,cell\nv0,1\nv1,9\n", "cell of entry 2 is 9, expected 0 to 8"),
         ("track,cell\n0,1\n0\n", "not a table of numbers"),
         (

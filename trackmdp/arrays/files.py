@@ -190,7 +190,10 @@ def first_line(stream: BinaryIO) -> list[str]:
     line = stream.readline(_LONGEST_HEAD)
     if len(line) == _LONGEST_HEAD:
         raise ValueError(f"a first line of more than {_LONGEST_HEAD:,} bytes")
-    return [name.strip().strip('"') for name in line.decode("utf-8-sig").split(",")]
+    names = [name.strip().strip('"') for name in line.decode("utf-8-sig").split(",")]
+    if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
+        raise ValueError(f"{names[0][:80]!r}: expected commas between columns")
+    return names
 
 
 @contextmanager
@@ -253,6 +256,9 @@ def _csv(stream: BinaryIO, comments: str | None = "#", **how: Any) -> Array:
     text = io.TextIOWrapper(stream, encoding="utf-8-sig")
     try:
         table: Array = np.loadtxt(text, delimiter=",", ndmin=2, comments=comments, **how)
+    except ValueError as error:
+        said = str(error).rstrip(".")
+        raise ValueError(f"{said}; expected numbers with commas between them") from None
     finally:
         text.detach()  # else it would close the stream
     return table
