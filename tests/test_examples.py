@@ -156,7 +156,8 @@ def test_a_tracker_is_driven_by_a_file_of_detections(tmp_path: Path) -> None:
     table = np.eye(9, dtype=bool)[:, None].repeat(2, axis=1)
     Policy.from_dense(task, table).save(tmp_path / "policy.npz")
     lines = ["x,y", "5,5", "9,9", ",", "15,5", "15,6", "15,7", "40,5", "5,5"]
-    (tmp_path / "seen.csv").write_text("\n".join(lines) + "\n")
+    # With the mark at the head that spreadsheets write.
+    (tmp_path / "seen.csv").write_text("\n".join(lines) + "\n", encoding="utf-8-sig")
     words = (str(tmp_path / "policy.npz"), str(tmp_path / "seen.csv"))
     assert run(str(EXAMPLES / "tracker.py"), *words) == [
         "step 1: sensors 6: located in cell 6",

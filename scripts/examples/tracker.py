@@ -24,7 +24,7 @@ def main(policy_file: Path, detections: Path) -> None:
     """Print each step, and in the end how often the target was located."""
     policy = tm.Policy.load(policy_file)
     tracker, steps, located, sensing, safe = None, 0, 0, 0, 0
-    with detections.open(newline="", encoding="utf-8") as stream:
+    with detections.open(newline="", encoding="utf-8-sig") as stream:
         for row in csv.DictReader(stream):
             axes = ("lat", "lon") if "lat" in row else ("x", "y")
             at = [float(row[name]) for name in axes if row[name]]
