@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ from trackmdp.solvers import rules
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.frontier import frontier
 from trackmdp.solvers.lookahead import solve as looked_ahead
-from trackmdp.solvers.solve import solve
+from trackmdp.solvers.solve import run_solver, solve
 from trackmdp.world.model import World
 
 
@@ -174,3 +176,24 @@ def test_a_mean_budget_gives_two_policies_and_how_often_to_draw_each(tmp_path: P
     assert main([*words, "cost.mean_budget=9"]) == 0
     content = json.loads((tmp_path / "mean_budget.json").read_text(encoding="utf-8"))
     assert content["binding"] is False
+
+
+@pytest.mark.parametrize(("corners", "mixed"), [(1, False), (3, True)])
+def test_ctrl_c_while_the_mixture_is_sought_is_an_interruption(
+    corners: int, mixed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The sets of the policy without the budget are written by then, and the mixture as far as it is known."""
+
+    def run(world: Any, choice: Any, *args: Any, **kwargs: Any) -> Any:
+        found = run_solver(world, choice, *args, **kwargs)
+        return replace(found, interrupted=next(counted) >= corners)
+
+    counted = itertools.count(1)
+    monkeypatch.setattr("trackmdp.solvers.frontier.run_solver", run)
+    words = ["solve", "grid.size=4", f"hydra.run.dir={tmp_path}", "cost.mean_budget=0.7"]
+    assert main(words) == 130
+    without = json.loads((tmp_path / "solution.json").read_text(encoding="utf-8"))
+    path = tmp_path / "mean_budget.json"
+    assert path.is_file() == mixed
+    # The bound on policies with any number of sensors holds as well.
+    assert not mixed or json.loads(path.read_text(encoding="utf-8"))["upper"] <= without["upper"]

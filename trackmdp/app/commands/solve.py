@@ -151,10 +151,14 @@ def _on_average(
         write_json(folder / path, {"sensors": most, "binding": False})
         at.print(f"cost.mean_budget={most:g}: the policy above has fewer sensors per step")
         return
-    found = trace(world, cfg.solver, 1e-3, near=most)
+    with reporting(at, f"cost.mean_budget={most:g}") as show:
+        found = trace(world, cfg.solver, 1e-3, show, most)
+    if found.interrupted and found.corners[0].sensors > most:
+        raise KeyboardInterrupt  # no two policies around it yet
     mixture = found.at(sensors=most)
     value = sum(weight * value_of(world, each.table).aihtr for weight, each in mixture.parts)
-    upper = max(value, found.worth(most, price))
+    # The bound on policies of any number of sensors may be the smaller one where a search was cut.
+    upper = max(value, min(found.worth(most, price), solution.upper))
     own = {"sensors": most, "binding": True, "lower": value, "upper": upper}
     write_json(folder / path, own | mixture_report(mixture, found))
     write_corners(folder / "mean_budget", found)
@@ -162,3 +166,5 @@ def _on_average(
     at.print(
         f"mixture: AIHTR {value:,.6f}, no policy with as few sensors has more than {upper:,.6f}"
     )
+    if found.interrupted:
+        raise KeyboardInterrupt
