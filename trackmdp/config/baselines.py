@@ -117,7 +117,7 @@ class OptimalConfig(BaselineConfig):
         "choices of branch and bound after which the bracket is left as it is", unit="nodes"
     )
     time_limit: float | None = option(
-        "stop after this time even so; the output then names it; null = never",
+        "stop after this time even so, at each price where there are several; the output then names it; null = never",
         unit="s",
         gt=0,
     )
