@@ -268,7 +268,7 @@ def test_the_command_values_a_baseline_and_a_trained_policy(tmp_path: Path) -> N
         (["train"], "sensor=false_alarm: expected perfect, miss or footprint"),
         (
             ["evaluate", "baseline=clocked", "sensor.p_f=1"],
-            "sensor.p_f=1.0: expected a number >= 0 and < 1",
+            "sensor.p_f=1: expected a number >= 0 and < 1",
         ),
         (
             ["evaluate", "baseline=clocked", "log=[mcap]"],

@@ -253,7 +253,7 @@ def test_ctrl_c_leaves_the_corners_found_so_far() -> None:
 @pytest.mark.parametrize(
     ("world", "options", "named"),
     [
-        (small(None), {"resolution": 0.0}, "resolution=0.0: expected"),
+        (small(None), {"resolution": 0.0}, "resolution=0: expected"),
         (small(None), {"solver": "qmpd"}, "solver=qmpd: expected one of"),
         (small(None), {"nodes": 0}, "solver.nodes=0: expected"),
         (small(None), {"near": -1.0}, "near=-1.0: expected"),

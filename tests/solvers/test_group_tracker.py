@@ -60,7 +60,7 @@ def test_a_tracker_asks_for_the_safe_action_when_a_clock_runs_out() -> None:
         ("tracker", (1,), r"tracker\(1\): expected 2, one for each target"),
         ("report", (1,), r"report\(1\): expected 2, one for each target"),
         ("report", ([0.5, None],), "report: cell=0.5: expected an integer"),
-        ("report", (["a", None],), "report: cell=a: expected an integer"),
+        ("report", (["a", None],), "report: cell='a': expected an integer"),
         ("report", ([1, None],), "a cell is seen by none of the 1 sensors that are on"),
         ("report", ([None, None], [9]), "report: gone=9: expected an integer from 0 to 1"),
     ],
