@@ -295,7 +295,7 @@ def test_a_belief_within_the_tolerance_passes() -> None:
 
 @pytest.mark.parametrize("episodes", [-1, 1.5, "3"])
 def test_a_number_of_episodes_that_is_none_is_refused(episodes: Any) -> None:
-    with pytest.raises(UserError, match=f"episodes={episodes}"):
+    with pytest.raises(UserError, match=f"episodes={episodes!r}"):
         simulate(WORLD, policy(), episodes)
 
 

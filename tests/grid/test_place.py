@@ -66,7 +66,7 @@ def test_without_a_place_nothing_is_guessed() -> None:
         ):
             call()
     for cell in (35, 1.0, "x"):
-        with pytest.raises(UserError, match=f"^place_of: cell={cell}: .* from 0 to 34$"):
+        with pytest.raises(UserError, match=f"^place_of: cell={cell!r}: .* from 0 to 34$"):
             task(PLACES["UTM"]).place_of(cell)  # type: ignore[arg-type]
     for position in (("x", "y"), (None, 1), (10**400, 1)):
         with pytest.raises(UserError, match=r"^cell_of: \(.*, expected lat, lon as numbers$"):

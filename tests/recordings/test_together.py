@@ -300,7 +300,7 @@ APART30 = by_hand(*(np.random.default_rng(k).integers(9, size=6).tolist() for k 
 @pytest.mark.parametrize("count", [0, 1.5, "2", 10**9])
 def test_a_wrong_number_of_targets_is_refused(count: Any) -> None:
     setting = recorded(by_hand([0, 1, 2], [2, 1, 0]))
-    with pytest.raises(UserError, match=f"count={count}: expected an integer from 1 to 1,000"):
+    with pytest.raises(UserError, match=f"count={count!r}: expected an integer from 1 to 1,000"):
         Group.of_tracks(setting, count)
 
 
