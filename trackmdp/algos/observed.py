@@ -24,6 +24,7 @@ from trackmdp.algos.moves import known_as
 from trackmdp.arrays.entries import ends_of, ones_at, row_index
 from trackmdp.arrays.types import Array, BoolArray, IndexArray, Indices
 from trackmdp.recordings.tracks import Tracks
+from trackmdp.seeding import derive
 from trackmdp.sensing.coverage import reported
 from trackmdp.sensing.task import Task
 from trackmdp.sensing.windows import Window
@@ -31,6 +32,10 @@ from trackmdp.world.problem_file import as_arrays, from_arrays
 
 _ENDING = 8
 """Cells at the end of a path that identify its recording: wherever a path began, it ends as its recording."""
+_STRETCHES, _DRAWS = (8, 10, 13, 18, 27, 40), 16
+"""Last cells among which so many random sets of them are compared where some are unknown. Of 502 vehicles followed 24
+times each by sensors that miss once in ten, 33 % of the paths had names of their own by cells in a row, 4 % by these;
+plans were then judged by recordings that they were learned from, and earned 11.7 less, not 6.4, on others."""
 _LONGEST_WAIT = 16
 """Misses of the safe action up to which the cells in between are inferred."""
 _UNKNOWN = -(2**40)
@@ -279,21 +284,30 @@ def _goes_on(tracks: Tracks) -> BoolArray:
 
 
 def _recordings(line: Array, seen: BoolArray, first: IndexArray) -> IndexArray:
-    """`[K]`, one number for the paths of one recording: paths that share a run of `_ENDING` located cells.
+    """`[K]`, one number for the paths of one recording: paths that share `_ENDING` located cells near their ends.
 
-    The runs are compared at the same distance from the ends of the paths; where no cell is unknown, at the ends alone.
+    Without unknown cells these are the last ones. Else they are random ones of the last `_STRETCHES`, of which each
+    path takes those about as long as itself: recordings that leave by one road differ before it.
     """
-    count, last = len(first) - 1, first[1:] - 1
-    paths, runs = [], []
-    for distance in range(1 if seen.all() else _ENDING):
-        place = last[:, None] - distance - np.arange(_ENDING)
+    count, length = len(first) - 1, np.diff(first)
+    rng = np.random.default_rng(derive(0, "recordings"))
+    # At least so many: of a short path at most two are left out, of two or three cells none.
+    least = np.minimum(_ENDING, np.maximum(length - 2, np.minimum(length, 3)))
+    paths, numbers, found = [], [], 0
+    stretches = [_ENDING] if seen.all() else np.repeat(_STRETCHES, _DRAWS).tolist()
+    for stretch in stretches:
+        distance = np.sort(rng.permutation(stretch)[:_ENDING])
+        place = first[1:, None] - 1 - distance
         there = place >= first[:-1, None]
-        run = np.where(there, line[np.maximum(place, 0)], -1)
-        if not seen.all():  # of short paths nothing is compared
-            there &= seen[np.maximum(place, 0)] & there.all(axis=1, keepdims=True)
-        whole = np.flatnonzero(there[:, 0] if seen.all() else there.all(axis=1))
+        place = np.maximum(place, 0)
+        known = (seen[place] | ~there).all(axis=1) & (there.sum(axis=1) >= least)
+        whole = np.flatnonzero(known & ((length < 2.5 * stretch) | (stretch == stretches[-1])))
+        run = np.where(there, line[place], -1)[whole]  # -1 before a path's beginning
+        number = np.unique(run, axis=0, return_inverse=True)[1].ravel()
         paths.append(whole)
-        runs.append(np.column_stack([run[whole], np.full(len(whole), distance)]))
-    number = np.unique(np.concatenate(runs), axis=0, return_inverse=True)[1].ravel()
-    pairs = ones_at(np.concatenate(paths), count + number, (count + len(number),) * 2)
-    return connected_components(pairs, directed=False)[1][:count].astype(np.int64)
+        numbers.append(found + number)
+        found += number.max(initial=-1) + 1
+    pairs = np.concatenate(paths), count + np.concatenate(numbers)
+    return connected_components(ones_at(*pairs, (count + found,) * 2), directed=False)[1][
+        :count
+    ].astype(np.int64)
