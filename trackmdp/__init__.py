@@ -25,6 +25,7 @@ _HOMES = {
     "Episodes": "trackmdp.episodes.batch",
     "Evaluation": "trackmdp.solvers.evaluation",
     "Group": "trackmdp.world.group",
+    "GroupTracker": "trackmdp.solvers.several.group_tracker",
     "ObservationVector": "trackmdp.environment.observation",
     "Policy": "trackmdp.policies.policy",
     "Recorded": "trackmdp.recordings.tracks",
@@ -61,6 +62,7 @@ if TYPE_CHECKING:  # the same once more, for type checkers and editors; `X as X`
     from trackmdp.solvers.evaluate import evaluate as evaluate
     from trackmdp.solvers.evaluation import Evaluation as Evaluation
     from trackmdp.solvers.frontier import frontier as frontier
+    from trackmdp.solvers.several.group_tracker import GroupTracker as GroupTracker
     from trackmdp.solvers.solution import Solution as Solution
     from trackmdp.solvers.solve import solve as solve
     from trackmdp.solvers.tradeoff import Tradeoff as Tradeoff

@@ -24,6 +24,7 @@ def test_a_tracker_follows_targets_as_the_simulation_does() -> None:
     moved = Beliefs.at(np.arange(2), np.array([0, 5])).moved(group)
     assert tracker.sensors() == found.policy.sets(seen, moved).tolist()
     tracker.report([1, 9])
+    tracker.sensors()
     with pytest.raises(UserError, match="target 0 is missed where it would have been detected"):
         tracker.report([None, 9])
     tracker.report([1, None], gone=[1])
@@ -33,7 +34,8 @@ def test_a_tracker_follows_targets_as_the_simulation_does() -> None:
     for cells in ([None, 3], [99, None], [1]):
         with pytest.raises(UserError, match="report"):
             tracker.report(cells)
-    tracker.report([None, None], gone=[0])
+    assert tracker.cells == [1, None]
+    tracker.report(gone=[0])
     assert tracker.sensors() == []
     assert not tracker.safe
 
@@ -42,9 +44,11 @@ def test_a_tracker_asks_for_the_safe_action_when_a_clock_runs_out() -> None:
     world = World(np.array([[0.5, 0.4], [0.4, 0.5]]), (1, 2), cost=5.0, t_max=0, safe_cost=10.0)
     tracker = solve(Group([world] * 2)).tracker([0, 1])
     assert tracker.sensors() == []
-    tracker.report([None, None])
+    tracker.report()
     assert tracker.safe
+    assert not tracker.sees(0)
     assert tracker.sensors() == [0, 1]
+    assert tracker.sees(0)
     with pytest.raises(UserError, match="missed where it would"):
         tracker.report([None, 0])
     tracker.report([1, 0])
@@ -61,7 +65,7 @@ def test_a_tracker_asks_for_the_safe_action_when_a_clock_runs_out() -> None:
         ("report", (1,), r"report\(1\): expected 2, one for each target"),
         ("report", ([0.5, None],), "report: cell=0.5: expected an integer"),
         ("report", (["a", None],), "report: cell='a': expected an integer"),
-        ("report", ([1, None],), "a cell is seen by none of the 1 sensors that are on"),
+        ("report", ([1, None],), "report: cell 1 is seen by none of the 1 sensors that are on"),
         ("report", ([None, None], [9]), "report: gone=9: expected an integer from 0 to 1"),
     ],
 )

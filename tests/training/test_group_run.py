@@ -138,6 +138,7 @@ def test_a_network_is_shown_the_last_sets_in_simulations_and_by_a_tracker() -> N
     for _ in range(2):
         assert tracker.sensors() == list(range(9))
         tracker.report([1, 4])
+        tracker = GroupTracker.restore(rule, tracker.state())
         assert tracker.sensors() == []
         tracker.report([None, None])
 
@@ -283,6 +284,8 @@ def test_a_plan_learned_for_one_follows_several(loaded: bool, tmp_path: Path) ->
     tracker = (tm.load_run(tmp_path) if loaded else run).tracker([0, 4])
     own = (run.policy.tracker(cell).sensors() for cell in (0, 4))
     assert tracker.sensors() == sorted({sensor for sensors in own for sensor in sensors})
+    rule = tm.load_run(tmp_path).rule
+    assert tm.GroupTracker.restore(rule, tracker.state()).sensors() == tracker.sensors()
     with pytest.raises(UserError, match="a run of one target"):
         tm.train(tm.make_world(size=3), "model_based", **few).tracker([0, 4])
 

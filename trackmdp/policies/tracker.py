@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self, TypeAlias
 
@@ -14,6 +13,7 @@ from trackmdp.arrays.numbers import whole_number
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.policies.belief import BeliefFilter
+from trackmdp.policies.following import Following, probabilities
 from trackmdp.policies.onnx_table import OnnxTable
 from trackmdp.policies.saved import load_policy
 from trackmdp.policies.table import PolicyTable
@@ -25,7 +25,7 @@ Plan: TypeAlias = PolicyTable | OnnxTable
 """A policy for a tracker: a `Policy` or its table, or one in an ONNX file."""
 
 
-class Tracker:
+class Tracker(Following):
     """Follows one target with a policy, and keeps the misses, the memory and the safe action as `TrackEnv` does.
 
     A step: `sensors()` are switched on, the target moves, and one of `report(cell)`, `report(None)` or `exited()`
@@ -77,8 +77,6 @@ class Tracker:
         self._policy = _plan(policy)
         self._task, self._world = self._policy.task, _checked(world, self._policy.task)
         self.key, self.misses, self.steps = 0, 0, 0
-        self._on: list[int] | None = None
-        self._exited = False
         self._filter = None if world is None else BeliefFilter(world.kernel, world.modes)
         self._belief: Array = np.zeros((1, 0))  # [1, Z] where the motion is known
         self.seed = whole_number("tracker: seed", seed, 0)
@@ -99,29 +97,8 @@ class Tracker:
 
     @property
     def safe(self) -> bool:
-        """Whether the safe action is due: all sensors on."""
+        """See `Following`."""
         return self.misses > self._task.t_max and not self._exited
-
-    def sensors(self) -> list[int]:
-        """The ids of the sensors to switch on now, in order; the same until the next report.
-
-        Raises:
-            UserError: the target has exited.
-        """
-        self._check_followed("sensors()")
-        if self._on is None:
-            everything = np.flatnonzero(self._task.available).tolist()
-            self._on = everything if self.safe else self._chosen()
-        return list(self._on)
-
-    def positions(self) -> list[tuple[float, float]]:
-        """The positions of the cells sensed now, (lat, lon) or (x, y); those of `sensors()`, but for footprints.
-
-        Raises:
-            UserError: the target has exited, or the place of the grid is not known.
-        """
-        self.sensors()
-        return [self._task.place_of(cell) for cell in np.flatnonzero(self._seen()).tolist()]
 
     def belief(self) -> Array:
         """`[M]` probability of each cell now, after the last report.
@@ -133,23 +110,6 @@ class Tracker:
         if self._filter is None:
             raise UserError("belief(): the motion is not known, expected tracker(..., world=...)")
         return self._filter.cells(self._belief)[0]
-
-    def sees(self, cell: int) -> bool:
-        """Whether a sensor that is on covers a cell; the safe action does everywhere. None is on before `sensors()`.
-
-        Raises:
-            UserError: the cell is outside the grid.
-        """
-        return bool(self._seen()[whole_number("sees: cell", cell, 0, self._task.num_cells - 1)])
-
-    def _seen(self) -> BoolArray:
-        """`[M]` whether a sensor that is on covers a cell."""
-        task = self._task
-        if self._on is None or self.safe:
-            return np.full(task.num_cells, self._on is not None)
-        action = np.zeros(task.total_sensors, dtype=bool)
-        action[self._on] = True
-        return task.covered(action)
 
     def report(
         self,
@@ -169,9 +129,7 @@ class Tracker:
             UserError: no `sensors()` before, or none of them sees this cell; the cell is outside the grid; the mode is
                 missing, or given where detections do not reveal it; the target has exited.
         """
-        self._check_followed("report")
-        if self._on is None:
-            raise UserError("report: no sensors() since the last report, expected sensors() before")
+        self._check_asked()
         cell = self._one("report", cell, at)
         if cell is None:
             if mode is not None:
@@ -197,7 +155,7 @@ class Tracker:
         self._exited, self._on = True, None
 
     def state(self) -> dict[str, Any]:
-        """All that is needed to go on later, as JSON takes it; see `restore`."""
+        """See `Following`."""
         numbers = {name: getattr(self, name) for name in _NUMBERS}
         belief = None if self._filter is None else self._belief[0].tolist()
         own = {"on": self._on, "exited": self._exited, "belief": belief}
@@ -212,15 +170,11 @@ class Tracker:
         Raises:
             UserError: the state is of another grid, other sensors or another memory, or is no state.
         """
-        expected = {"task", *_NUMBERS, "on", "exited", "belief"}
-        if not isinstance(state, Mapping) or set(state) != expected:
-            raise UserError(f"state: expected a dict with {', '.join(sorted(expected))}")
         plan = _plan(policy)
         task = plan.task
         # Any mode: key and belief are replaced below.
         tracker = cls(plan, 0, mode=0 if task.keys.modes > 1 else None, world=world)
-        if state["task"] != tracker._facts():
-            raise UserError(f"state: made for {state['task']}, expected {tracker._facts()}")
+        tracker._check_state(state)
         most = {"key": task.num_keys - 1, "misses": task.num_choices}
         for name in _NUMBERS:
             found = whole_number(f"state: {name}", state[name], 0, most.get(name, math.inf))
@@ -229,41 +183,8 @@ class Tracker:
             raise UserError("state: expected True or False as exited")
         tracker._on, tracker._exited = tracker._restored(state["on"]), state["exited"]
         if tracker._filter is not None:
-            tracker._belief = _probabilities(state["belief"], tracker._belief.shape[1])
+            tracker._belief = probabilities(state["belief"], tracker._belief.shape[1])
         return tracker
-
-    def _restored(self, on: Any) -> list[int] | None:
-        """The sensors that are on in a state.
-
-        Raises:
-            UserError: a number is no sensor that can be chosen.
-        """
-        if not isinstance(on, list | None):
-            raise UserError("state: expected a list or None as on")
-        last = self._task.total_sensors - 1
-        found = [whole_number("state: on", each, 0, last) for each in on or ()]
-        if found != sorted(set(found)) or not self._possible(np.array(found, np.int64)).all():
-            raise UserError(f"state: on={found}: expected sensors that can be on, in order")
-        return None if on is None else found
-
-    def _facts(self) -> dict[str, Any]:
-        """The facts of the task that keys and sensor ids depend on."""
-        keys = asdict(self._task.keys) | {"size": list(self._task.size)}
-        return keys | {"sensors": self._task.total_sensors}
-
-    def _check_followed(self, call: str) -> None:
-        if self._exited:
-            raise UserError(f"{call}: the target has exited, expected a new tracker")
-
-    def _one(self, call: str, cell: int | None, at: tuple[float, float] | None) -> int | None:
-        """The cell, which may be given by a position."""
-        if at is None:
-            return cell
-        if cell is not None:
-            raise UserError(f"{call}: cell={cell} and at={at}, expected one of the two")
-        if not isinstance(at, Iterable) or len(pair := tuple(at)) != 2:
-            raise UserError(f"{call}: at={at}, expected two numbers")
-        return self._task.cell_of(*pair)
 
     def _locate(self, call: str, cell: int, mode: int | None, *, first: bool = False) -> None:
         """Note a detection; nothing is changed where it is refused."""
@@ -273,11 +194,8 @@ class Tracker:
             wanted = f"one of 0 ... {keys.modes - 1}" if keys.modes > 1 else "none"
             raise UserError(f"{call}: mode={mode}, expected {wanted}")
         own = 0 if mode is None else whole_number(f"{call}: mode", mode, 0, keys.modes - 1)
-        if not (first or self.sees(int(place))):
-            raise UserError(
-                f"{call}: cell {cell} is seen by none of the {len(self._on or ())} sensors that are on, expected "
-                "one that is, or None"
-            )
+        if not first:
+            self._check_seen(call, int(place))
         before = np.int64(self.key)
         key = keys.start(place, own) if first else keys.next(before, self.misses, place, own)
         self.key, self.misses = int(key), 0
@@ -287,7 +205,7 @@ class Tracker:
             self._belief = self._filter.detect(np.array([place]), told, predicted)
 
     def _chosen(self) -> list[int]:
-        """The policy's own choice, before any safe action."""
+        """See `Following`."""
         policy = self._policy
         sensors = np.array(policy.sensors(self.key, self.misses), dtype=np.int64)
         kept = self._possible(sensors)
@@ -302,24 +220,10 @@ class Tracker:
         return sensors[draws < policy.chances(self.key, self.misses)[kept]].tolist()
 
     def _possible(self, sensors: IndexArray) -> BoolArray:
-        """Whether each of `sensors` can be on now."""
+        """See `Following`."""
         start = None if self.safe else np.full(len(sensors), self.cell)
         possible = self._task.choosable(start, sensors)
         return np.ones(len(sensors), dtype=bool) if possible is None else possible
-
-
-def _probabilities(given: Any, states: int) -> Array:
-    """`[1, states]`, the belief in a state.
-
-    Raises:
-        UserError: there are no such probabilities in it.
-    """
-    numbers = given if isinstance(given, list) else []
-    if all(type(each) in (int, float) and 0 <= each <= 1.1 for each in numbers):
-        found = np.array([numbers], dtype=np.float64)
-        if found.shape[1] == states and 0 < found.sum() < 1.1:
-            return found
-    raise UserError(f"state: belief, expected {states} probabilities")
 
 
 def _plan(policy: Plan | str | Path) -> Plan:

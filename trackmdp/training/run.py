@@ -31,6 +31,7 @@ from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import group_rule
 from trackmdp.solvers.evaluation import Evaluation, figures
 from trackmdp.solvers.several.group_tracker import GroupTracker
+from trackmdp.solvers.several.merging import Rule
 from trackmdp.solvers.solution import Solution
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Learning, Row, Training
@@ -80,20 +81,32 @@ class Run(Carded):
 
         return DataFrame(self.columns)
 
-    def tracker(self, cells: Sequence[int]) -> GroupTracker:
-        """A tracker that follows the run's several targets, located in `cells`, as its figures have it.
+    @property
+    def rule(self) -> Rule:
+        """The policy for the run's several targets, as its figures have it.
 
         Raises:
-            UserError: the run is of one target, or these are other cells than one of the grid for each target.
+            UserError: the run is of one target.
         """
         if self.several is not None:
-            rule = group_rule(self.several.group, self.policy, self.several.merge)
-        elif self.folder is not None and (cfg := load_run_config(self.folder)).targets.count > 1:
+            return group_rule(self.several.group, self.policy, self.several.merge)
+        if self.folder is not None and (cfg := load_run_config(self.folder)).targets.count > 1:
             group = group_of(problem_of(cfg, self.folder), cfg.targets.count)
-            rule = group_rule(group, self.policy, cfg.targets.merge)
-        else:
-            raise UserError("tracker: a run of one target, expected run.policy.tracker(cell)")
-        return GroupTracker(rule, cells)
+            return group_rule(group, self.policy, cfg.targets.merge)
+        raise UserError("tracker: a run of one target, expected run.policy.tracker(cell)")
+
+    def tracker(
+        self,
+        cells: Sequence[int] | None = None,
+        *,
+        at: Sequence[tuple[float, float]] | None = None,
+    ) -> GroupTracker:
+        """A tracker that follows the run's several targets, located in `cells` or `at` positions, with `rule`.
+
+        Raises:
+            UserError: the run is of one target; or as of `GroupTracker`.
+        """
+        return GroupTracker(self.rule, cells, at=at)
 
     def card(self) -> Card:
         """Algorithm, budget, figures, bound and folder."""

@@ -42,9 +42,14 @@ class GroupSolution(Carded):
         """The policy that adds up the gains of all targets."""
         return Merged(self.group, self.tables)
 
-    def tracker(self, cells: Sequence[int]) -> GroupTracker:
-        """A tracker that follows targets located in `cells`, one for each, with `policy`."""
-        return GroupTracker(self.policy, cells)
+    def tracker(
+        self,
+        cells: Sequence[int] | None = None,
+        *,
+        at: Sequence[tuple[float, float]] | None = None,
+    ) -> GroupTracker:
+        """A tracker that follows targets located in `cells` or `at` positions, with `policy`."""
+        return GroupTracker(self.policy, cells, at=at)
 
     @property
     def apart(self) -> float:

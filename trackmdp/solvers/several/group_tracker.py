@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Self
 
 import numpy as np
 
 from trackmdp.arrays.numbers import whole_number
+from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
-from trackmdp.solvers.several.merging import Beliefs, Rule, followed
+from trackmdp.policies.following import Following, probabilities
+from trackmdp.solvers.several.merging import Beliefs, Clocks, Rule, followed
 
 
-class GroupTracker:
+class GroupTracker(Following):
     """A tracker of K targets that are located at the start.
 
     Args:
-        policy: for several targets, such as `GroupSolution.policy`.
+        policy: for several targets: `GroupSolution.policy` or `Run.rule`.
         cells: of the targets, by their numbers.
+        at: their positions in place of cells, as of `Tracker`.
 
     Raises:
-        UserError: other cells than one of the grid for each target.
+        UserError: no such policy, or other cells or positions than one of the grid for each target.
 
     Example:
         >>> from trackmdp.solvers.solve import solve
@@ -29,20 +32,36 @@ class GroupTracker:
         >>> tracker.sensors()
         [1, 4]
         >>> tracker.report([1, None])
-        >>> tracker.misses
-        [0, 1]
+        >>> tracker
+        GroupTracker(cells=[1, 3], misses=[0, 1], safe=False)
     """
 
-    def __init__(self, policy: Rule, cells: Sequence[int]) -> None:
-        self._policy, self._group = policy, policy.group
-        count, self._cells = len(self._group), policy.task.num_cells
-        found = [
-            whole_number("tracker: cell", cell, 0, self._cells - 1)
-            for cell in _each(cells, "tracker", count)
-        ]
-        located = np.array(found) + self._group.kind * self._cells
+    def __init__(
+        self,
+        policy: Rule,
+        cells: Sequence[int] | None = None,
+        *,
+        at: Sequence[tuple[float, float]] | None = None,
+    ) -> None:
+        if not isinstance(policy, Rule):
+            raise UserError(
+                f"tracker: a {type(policy).__name__}, expected a policy of several targets"
+            )
+        self._policy, self._group, self._task = policy, policy.group, policy.task
+        self._first = self._group.kind * self._task.num_cells  # `[K]`, states of cell 0
+        found = self._given("tracker", cells, at)
+        located = np.array([self._cell("tracker", cell) for cell in found]) + self._first
         self._clocks = policy.start(located[None])
-        self._beliefs = Beliefs.at(np.arange(count), located)
+        self._beliefs = Beliefs.at(np.arange(len(self._group)), located)
+
+    def __repr__(self) -> str:
+        return f"GroupTracker(cells={self.cells}, misses={self.misses}, safe={self.safe})"
+
+    @property
+    def cells(self) -> list[int | None]:
+        """The cell of each target's last detection; None where it has left."""
+        cells = (self._clocks.located[0] - self._first).tolist()
+        return [cell if here else None for cell, here in zip(cells, self.present, strict=True)]
 
     @property
     def misses(self) -> list[int]:
@@ -59,53 +78,118 @@ class GroupTracker:
         """Whether the safe action is due, which locates all targets."""
         return bool(self._clocks.late(self._policy.task.t_max)[0])
 
-    def sensors(self) -> list[int]:
-        """The sensors to switch on in this step: all where the safe action is due, none once all targets have left."""
+    def _facts(self) -> dict[str, Any]:
+        return super()._facts() | {"targets": list(self._group.targets)}
+
+    def _given(self, call: str, cells: Any, at: Any) -> list[int | None]:
+        """A cell for each target, which may be given by positions."""
+        none, count = [None] * len(self._group), len(self._group)
+        parts = [_each(none if part is None else part, call, count) for part in (cells, at)]
+        return [self._one(call, *pair) for pair in zip(*parts, strict=True)]
+
+    def _cell(self, call: str, cell: Any) -> int:
+        return whole_number(f"{call}: cell", cell, 0, self._task.num_cells - 1)
+
+    def _chosen(self) -> list[int]:
+        """See `Following`; none once all targets have left."""
         if not self._clocks.present.any():
             return []
-        if self.safe:
-            return [int(j) for j in np.flatnonzero(self._policy.task.available)]
-        moved = self._beliefs.moved(self._group)
-        return [int(j) for j in self._policy.sets(self._clocks, moved)]
+        return self._policy.sets(self._clocks, self._beliefs.moved(self._group)).tolist()
 
-    def report(self, cells: Sequence[int | None], gone: Iterable[int] = ()) -> None:
+    def _possible(self, sensors: IndexArray) -> BoolArray:
+        """See `Following`."""
+        return self._task.available[sensors]
+
+    def belief(self) -> Array:
+        """`[K, M]` probability of each cell now, after the last report; 0 where the target has left."""
+        found = np.zeros((len(self._group), self._task.num_cells))
+        row, state = self._beliefs.row, self._beliefs.state
+        found[row, state - self._first[row]] = self._beliefs.mass
+        return found
+
+    def report(
+        self,
+        cells: Sequence[int | None] | None = None,
+        gone: Iterable[int] = (),
+        *,
+        at: Sequence[tuple[float, float] | None] | None = None,
+    ) -> None:
         """Go on by one step.
 
         Args:
             cells: for each target the cell in which it was detected, or None.
             gone: numbers of targets that have left the grid in this step.
+            at: positions in place of cells.
 
         Raises:
-            UserError: a cell is none of the grid or seen by no sensor that is on, a target that has left is detected,
-                or one is missed that cannot be; or `gone` has no numbers of targets.
+            UserError: no `sensors()` before; a cell is none of the grid or seen by no sensor that is on, a target that
+                has left is detected, or one is missed that cannot be; or `gone` has no numbers of targets.
         """
+        self._check_asked()
         before, count = self._clocks, len(self._group)
         left = [
             whole_number("report: gone", each, 0, count - 1) for each in _each(gone, "report: gone")
         ]
         present = before.present[0] & ~np.isin(np.arange(count), left)
-        cells = _each(cells, "report", count)
+        cells = self._given("report", cells, at)
         seen = np.array([cell is not None for cell in cells])
         if (seen & ~present).any():
             raise UserError(f"report({cells}): expected None for a target that has left")
-        place = np.array(
-            [
-                0 if cell is None else whole_number("report: cell", cell, 0, self._cells - 1)
-                for cell in cells
-            ]
-        )
-        on, moved = np.array(self.sensors(), dtype=np.int64), self._beliefs.moved(self._group)
-        if not self.safe and (seen & ~np.isin(place, on)).any():
-            raise UserError(
-                f"report({cells}): a cell is seen by none of the {len(on)} sensors that are on, expected "
-                "one that is, or None"
-            )
-        states, reports = place + self._group.kind * self._cells, (present[None], seen[None])
+        place = np.array([0 if cell is None else self._cell("report", cell) for cell in cells])
+        for cell in place[seen]:
+            self._check_seen("report", int(cell))
+        on, moved = np.array(self._on, dtype=np.int64), self._beliefs.moved(self._group)
+        states, reports = place + self._first, (present[None], seen[None])
         clocks, beliefs = followed(self._group, before, moved, on, states[None], reports)
         lost = np.setdiff1d(np.flatnonzero(present & ~seen), beliefs.row)
         if len(lost) and self._group.recorded is None:  # a track may make moves that no other made
             raise UserError(f"report: target {lost[0]} is missed where it would have been detected")
-        self._clocks, self._beliefs = clocks, beliefs
+        self._clocks, self._beliefs, self._on = clocks, beliefs, None
+
+    def state(self) -> dict[str, Any]:
+        """See `Following`."""
+        past = self._clocks.history
+        return {
+            "task": self._facts(),
+            "cells": (self._clocks.located[0] - self._first).tolist(),
+            "misses": self.misses,
+            "present": self.present,
+            "history": None if past is None else np.flatnonzero(past).tolist(),
+            "on": self._on,
+            "belief": [each.tolist() if each.any() else None for each in self.belief()],
+        }
+
+    @classmethod
+    def restore(cls, policy: Rule, state: Mapping[str, Any]) -> Self:
+        """The tracker of a `state()`, with the same policy or another one of the same grid and targets.
+
+        Raises:
+            UserError: the state is of another grid, other sensors or other targets, or is no state.
+        """
+        tracker = cls(policy, [0] * len(policy.group))
+        tracker._check_state(state)
+        task, count, past = policy.task, len(policy.group), tracker._clocks.history
+        cells, misses, present, beliefs = (
+            _each(state[name], f"state: {name}", count)
+            for name in ("cells", "misses", "present", "belief")
+        )
+        if not all(isinstance(here, bool) for here in present):
+            raise UserError("state: expected True or False as present")
+        located = np.array([tracker._cell("state", cell) for cell in cells]) + tracker._first
+        missed = [whole_number("state: misses", n, 0, task.num_choices) for n in misses]
+        if past is not None:
+            steps = _each(state["history"], "state: history")
+            on = [whole_number("state: history", each, 0, past.size - 1) for each in steps]
+            past.reshape(-1)[np.array(on, np.int64)] = True
+        mass = np.zeros((count, task.num_cells))
+        for number, (here, given) in enumerate(zip(present, beliefs, strict=True)):
+            if here and given is not None:
+                mass[number] = probabilities(given, task.num_cells)
+        row, cell = np.nonzero(mass)
+        tracker._beliefs = Beliefs(row, cell + tracker._first[row], mass[row, cell])
+        tracker._clocks = Clocks(located[None], np.array([missed]), np.array([present]), past)
+        tracker._on = tracker._restored(state["on"])
+        return tracker
 
 
 def _each(given: Any, call: str, count: int | None = None) -> list[Any]:

@@ -78,9 +78,14 @@ class JointRule(Rule):
             action = self.actor(state)["action"].cpu().numpy()
         return action & self.task.available
 
-    def tracker(self, cells: Sequence[int]) -> GroupTracker:
-        """A tracker that follows targets located in `cells`, one for each."""
-        return GroupTracker(self, cells)
+    def tracker(
+        self,
+        cells: Sequence[int] | None = None,
+        *,
+        at: Sequence[tuple[float, float]] | None = None,
+    ) -> GroupTracker:
+        """A tracker that follows targets located in `cells` or `at` positions."""
+        return GroupTracker(self, cells, at=at)
 
     def packed(self) -> list[dict[str, Any]]:
         """The weights by their names, in single precision as they were learned, and the kind of each target."""
