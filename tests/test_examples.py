@@ -170,6 +170,30 @@ def test_a_tracker_is_driven_by_a_file_of_detections(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("policy", "lines", "said"),
+    [
+        ("none.npz", ["x,y", "5,5"], "none.npz: no such file"),
+        ("policy.npz", [], "No such file or directory: '.*seen.csv'"),
+        ("policy.npz", ["x,y", "5,500"], "cell_of: x, y = 5, 500 is outside of the grid"),
+        ("policy.npz", ["x,y", ","], r"tracker: at=\(\), expected two numbers"),
+        ("policy.npz", ["q", "5"], r"tracker: at=\(\), expected two numbers"),
+        ("policy.npz", ["x,y", "a,b"], "could not convert string to float: 'a'"),
+        ("policy.npz", ["id,x,y", "1,5,5", "2,15,5"], "seen.csv: ids 1, 2, expected one target"),
+    ],
+)
+def test_a_tracker_of_a_wrong_file_ends_in_a_line(
+    policy: str, lines: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Policy.all_on(Task(3, cost=0.1, place=Place((0.0, 0.0), 10.0))).save(tmp_path / "policy.npz")
+    if lines:
+        (tmp_path / "seen.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    words = ["tracker.py", str(tmp_path / policy), str(tmp_path / "seen.csv")]
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit, match=rf"^tracker.py: .*{said}"):
+        runpy.run_path(str(EXAMPLES / "tracker.py"), run_name="__main__")
+
+
 @pytest.mark.slow
 def test_a_tracker_follows_a_vehicle_that_was_held_out() -> None:
     *steps, figures = example("tracker")

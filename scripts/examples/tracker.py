@@ -17,19 +17,20 @@ import trackmdp as tm
 from trackmdp.errors import UserError
 from trackmdp.examples import example_file
 
-CITY = example_file("city.csv")
-
 
 def main(policy_file: Path, detections: Path) -> None:
     """Print each step, and in the end how often the target was located."""
     policy = tm.Policy.load(policy_file)
     tracker, steps, located, sensing, safe = None, 0, 0, 0, 0
     with detections.open(newline="", encoding="utf-8-sig") as stream:
-        for row in csv.DictReader(stream):
+        rows = list(csv.DictReader(stream))
+        if len(ids := sorted({row["id"] for row in rows if row.get("id")})) > 1:
+            raise UserError(f"{detections}: ids {', '.join(ids[:3])}, expected one target")
+        for row in rows:
             axes = ("lat", "lon") if "lat" in row else ("x", "y")
-            at = [float(row[name]) for name in axes if row[name]]
+            at = tuple(float(row[name]) for name in axes if row.get(name))
             if tracker is None:
-                tracker = policy.tracker(at=(at[0], at[1]))  # the first line is a detection
+                tracker = policy.tracker(at=at)  # the first line is a detection
                 continue
             on, due = tracker.sensors(), tracker.safe
             try:
@@ -51,7 +52,8 @@ def main(policy_file: Path, detections: Path) -> None:
 
 def town(folder: Path) -> tuple[Path, Path]:
     """A policy learned from most vehicles, and the longest of the recordings held out."""
-    tracks = tm.load_tracks(CITY, (18, 15), step=5, cell=50, cost=0.2, safe_cost=5, t_max=1)
+    city = example_file("city.csv")
+    tracks = tm.load_tracks(city, (18, 15), step=5, cell=50, cost=0.2, safe_cost=5, t_max=1)
     policy, detections = folder / "policy.npz", folder / "detections.csv"
     tm.train(tracks, "model_based", seed=0).policy.save(policy)
     own = tracks.held_out
@@ -64,7 +66,10 @@ def town(folder: Path) -> tuple[Path, Path]:
 
 if __name__ == "__main__":
     if len(sys.argv) == 3:
-        main(Path(sys.argv[1]), Path(sys.argv[2]))
+        try:
+            main(Path(sys.argv[1]), Path(sys.argv[2]))
+        except (UserError, OSError, ValueError) as error:
+            sys.exit(f"tracker.py: {error}")
     else:
         with tempfile.TemporaryDirectory() as temporary:
             main(*town(Path(temporary)))
