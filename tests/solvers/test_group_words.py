@@ -129,3 +129,12 @@ def test_commands_solve_and_evaluate_with_several_targets(tmp_path: Path) -> Non
     valued = json.loads((tmp_path / "b" / "evaluation.json").read_text(encoding="utf-8"))
     assert solved["lower"] <= valued["figures"]["aihtr"]["mean"] <= solved["upper"]
     assert valued["exact"] is True
+
+
+def test_gains_of_targets_that_never_exit_point_to_the_union() -> None:
+    """Two targets on two cells; all sensors, for .6 a step, earn 2."""
+    world = World(np.full((2, 2), 0.5), (1, 2), cost=0.3, t_max=1, max_steps=10)
+    group = Group([world] * 2)
+    with pytest.raises(UserError, match=r"never exits.*, or max_steps and targets.merge=union$"):
+        tm.evaluate(group, "all_on", merge="gains")
+    assert tm.evaluate(group, "all_on", merge="union").aihtr.mean == pytest.approx(14)

@@ -225,7 +225,10 @@ class Merged(Rule):
         # Plans are those of whole episodes, also where these are cut off.
         for kind, (world, table) in enumerate(zip(self.group.kinds, self.tables, strict=True)):
             renewal = Renewal(world, world.motion)
-            policy = Found(renewal, renewal.sets(table))
+            try:
+                policy = Found(renewal, renewal.sets(table))
+            except UserError as error:  # the target never exits
+                raise UserError(f"{error}, or max_steps and targets.merge=union") from None
             # Behind the cells stand those in which the safe action has missed, if it does.
             values.append(policy.value[: self.cells])
             after = policy.plans().after(policy.sets)
