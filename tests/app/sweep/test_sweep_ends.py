@@ -99,7 +99,7 @@ def test_a_run_whose_process_cannot_start_is_told_once(
 def test_a_run_that_cannot_leave_its_reason_is_told_in_a_line(
     here: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """On a full disk."""
+    """On a full disk, which would be as full at a second attempt."""
 
     def run(cfg: Any, folder: Path) -> None:
         raise RunError("the disk is full")
@@ -114,6 +114,7 @@ def test_a_run_that_cannot_leave_its_reason_is_told_in_a_line(
     assert "Traceback" not in said
     assert " failed: " in said
     assert said.endswith(f"failed.json: {os.strerror(errno.ENOSPC)}\n")
+    assert said.count(" failed: ") == 1
 
 
 @pytest.mark.slow

@@ -124,9 +124,10 @@ def _run(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
             # environment.
             with threads_of(jobs):
                 launch(jobs)
-        except UserError:  # no such cluster, which the next round would not find either
-            raise
         except Exception as error:
+            # No such cluster, or a file that cannot be written: the next round would meet the same.
+            if isinstance(error, UserError) or getattr(error, "filename", None):
+                raise
             why = f"the launcher broke down: {type(error).__name__}: {reason(error)}"
             sys.stderr.write(f"{why}\n")
         # Not "running": another process holds that folder, and is at it.
