@@ -292,6 +292,17 @@ def test_without_matplotlib_one_line_names_the_extra(
     assert re.search(r"needs matplotlib, which pip install .*\[report\]", capsys.readouterr().err)
 
 
+def test_a_misspelt_backend_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delitem(sys.modules, "matplotlib")
+    monkeypatch.setenv("MPLBACKEND", "ag")
+    sweep = write_sweep(tmp_path)
+    assert main(["report", f"sweep={sweep}", f"hydra.run.dir={tmp_path}/report"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("trackmdp report: MPLBACKEND: Key backend: 'ag' is not a valid value")
+
+
 def test_files_are_named_after_their_titles() -> None:
     assert figures.slug("a2c, gamma=0.9, Z=5, c=0.16") == "a2c-gamma-0-9-z-5-c-0-16"
     assert "/" not in figures.slug("kernel=table, path=/a/b")

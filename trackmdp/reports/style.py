@@ -13,6 +13,7 @@ from itertools import chain, cycle
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from trackmdp.arrays.types import AnyArray
+from trackmdp.errors import UserError
 from trackmdp.reports.tables import Table
 from trackmdp.reports.ticks import Axes as Axes
 from trackmdp.reports.ticks import label_ticks
@@ -114,7 +115,10 @@ class Figure:
 
 def draw_figure(table: Table, height: float, paint: Callable[[Canvas], None]) -> Figure:
     """A figure `WIDTH` x `height` inches that `paint` draws on."""
-    import matplotlib
+    try:
+        import matplotlib
+    except ValueError as error:
+        raise UserError(f"MPLBACKEND: {error}") from None
     from matplotlib.figure import Figure as New
 
     svg, png = io.BytesIO(), io.BytesIO()
