@@ -234,7 +234,7 @@ def test_price_files_are_checked_before_a_folder_is_made(
     (tmp_path / "semicolons.csv").write_text("1;1;1\n" * 3)
     for name, message in (
         ("short.csv", "3 values, expected one number or 9"),
-        ("negative.csv", "cell 4 has -2.0"),
+        ("negative.csv", "cell 4 has -2, expected"),
         ("broken.csv", "not a table of numbers"),
         ("semicolons.csv", "column 1; expected numbers with commas between them)"),
     ):

@@ -62,8 +62,14 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"grid.size": 0}, "grid.size=0: expected an integer >= 1"),
     ({"algo": "ppo", "algo.minibatches": 3}, "algo.minibatches=3: expected a divisor"),
     ({"kernel": "table"}, "kernel.path: missing, expected a path"),
-    ({"kernel": "given"}, "kernel.reveals: missing, expected a problem made in Python"),
-    ({"sensor": "given"}, "sensor.wide: missing, expected a problem made in Python"),
+    (
+        {"kernel": "given"},
+        "kernel.reveals: missing, expected another choice than given, which is made",
+    ),
+    (
+        {"sensor": "given"},
+        "sensor.wide: missing, expected another choice than given, which is made",
+    ),
     (
         {"algo": "a2c", "algo.credit": "per_sensor"},
         "algo.credit: renamed, expected algo=a2c_per_sensor",

@@ -257,6 +257,11 @@ def test_a_table_for_another_grid_is_named(tmp_path: Path) -> None:
         )
 
 
+def test_a_table_that_is_missing_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"^kernel\.regimes\[0\]\.path=.*t\.npy: no such file$"):
+        world_of("kernel=regimes", f"kernel.regimes=[{tmp_path}/t.npy, {{kernel: drift}}]")
+
+
 def test_a_target_that_stays_for_ever_is_named() -> None:
     stays = "{kernel: drift, exit_probability: 0}"
     with pytest.raises(UserError, match="from cell 0 the target never exits"):

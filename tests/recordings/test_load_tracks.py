@@ -112,7 +112,7 @@ def test_cells_need_no_gridding(tmp_path: Path) -> None:
     file = tmp_path / "t.csv"
     file.write_text("track,cell\n0,1\n")
     with pytest.raises(
-        UserError, match=r"^kernel\.step=50\.0: only for positions; kernel\.path=.* holds cells$"
+        UserError, match=r"^kernel\.step=50: only for positions; kernel\.path=.* holds cells$"
     ):
         tm.load_tracks(file, 3, step=50)
     for place in ({"cell": 50}, {"origin": [1, 2]}, {"crs": "EPSG:2056"}):

@@ -93,7 +93,7 @@ def one_each(
     within, expected = allowed
     if not (fine := np.asarray(within(values))).all():
         bad = int(np.flatnonzero(~fine)[0])
-        raise UserError(f"{source}: {each} {bad} has {values.flat[bad]}, expected {expected}")
+        raise UserError(f"{source}: {each} {bad} has {values.flat[bad]:.15g}, expected {expected}")
     return np.broadcast_to(values, (count,)).copy()
 
 

@@ -9,7 +9,7 @@ from trackmdp.config.options import choice, count_option, option
 from trackmdp.config.sensors import SensorConfig
 from trackmdp.config.world import GridConfig
 
-_SET = "a problem made in Python, for which trackmdp.train sets it"
+_SET = "another choice than given, which is made by trackmdp.train in Python and cannot be typed"
 
 
 @choice("kernel", "given", makes="trackmdp.world.problem_file:refuse_given")

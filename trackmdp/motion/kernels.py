@@ -105,8 +105,13 @@ def drift(
     return _homogeneous(size, window, weights, exit_probability, border)
 
 
-def load_table(size: Size, *, path: str | Path) -> sparse.csr_array:  # noqa: ARG001  (the file has its own size)
-    """Read a kernel from a .npy, .npz or .csv file.
+def load_table(
+    size: Size,  # noqa: ARG001  (the file has its own size)
+    *,
+    path: str | Path,
+    source: str = "kernel.path",
+) -> sparse.csr_array:
+    """Read a kernel from a .npy, .npz or .csv file, which messages name by `source`.
 
     An .npz holds one array, or one called `kernel`, or the arrays `data`, `indices`, `indptr` and `shape` of a CSR
     matrix, as `scipy.sparse.save_npz` writes them.
@@ -114,7 +119,7 @@ def load_table(size: Size, *, path: str | Path) -> sparse.csr_array:  # noqa: AR
     Raises:
         UserError: there is no such file, or it holds no square table of numbers.
     """
-    return canonical_kernel(read_matrix("kernel.path", path, name="kernel"), f"kernel.path={path}")
+    return canonical_kernel(read_matrix(source, path, name="kernel"), f"{source}={path}")
 
 
 def _blocks(grid: tuple[int, int]) -> list[_Offsets]:

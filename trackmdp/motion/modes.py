@@ -136,7 +136,9 @@ def switching(kernels: list[sparse.csr_array], switch: Array) -> sparse.csr_arra
 def _regime(size: Size, source: str, entry: dict[str, Any]) -> sparse.csr_array:
     """The kernel `[M, M]` of a regime."""
     options = {name: value for name, value in entry.items() if name != "kernel"}
-    kernel = canonical_kernel(make(GROUPS["kernel"][entry["kernel"]](**options), size), source)
+    more = {"source": f"{source}.path"} if entry["kernel"] == "table" else {}
+    made = make(GROUPS["kernel"][entry["kernel"]](**options), size, **more)
+    kernel = canonical_kernel(made, source)
     # One regime may have no exit as long as another one has.
     check_kernel(kernel, grid_size(size), truncates=True, source=source)
     return kernel

@@ -154,7 +154,9 @@ def _place_of_cells(own: Mapping[str, Any], source: str) -> Place | None:
     """
     for name in ("step", "max_gap"):
         if name in own:
-            raise UserError(f"kernel.{name}={own[name]}: only for positions; {source} holds cells")
+            raise UserError(
+                f"kernel.{name}={own[name]:.15g}: only for positions; {source} holds cells"
+            )
     place = Place.of(*(own.get(name) for name in ("cell", "origin", "crs")))
     if place is None and own:
         expected = "grid.cell and grid.origin, the place of the grid"

@@ -76,11 +76,13 @@ def poor(
 def _help(config: TrainConfig, task: Task) -> str:
     """The option that helps most."""
     algo = config.algo.name
+    typed = "algo" if config.algo.total_frames == config.collector.total_frames else "collector"
+    frames = f"try more {typed}.total_frames"
     if algo in ("a2c", "ppo", "dqn"):
         others = f"algo={algo}_per_sensor or " if task.budget is None else ""
-        return f"try more collector.total_frames, {others}algo=model_based"
+        return f"{frames}, {others}algo=model_based"
     if algo != "model_based":
         return "try algo=model_based"
     if getattr(config.algo, "estimate", None) == "moves":
         return "try algo.estimate=null"
-    return "try more collector.total_frames"
+    return frames

@@ -46,7 +46,7 @@ NEEDS_THE_MODEL = sorted(set(GROUPS["baseline"]) - {"all_on", "none", "random_k"
             f"kernel.path={CITY}",
             "kernel.step: missing, expected seconds from one cell to the next; kernel.path=",
         ),
-        ("train", "kernel.step=5", "kernel.step=5.0: only for positions; kernel.path="),
+        ("train", "kernel.step=5", "kernel.step=5: only for positions; kernel.path="),
         ("train", "grid.size=4 kernel.min_length=null", "kernel.path="),
         *(
             (

@@ -287,6 +287,13 @@ def test_the_advice_for_a_policy_below_one_of_less_memory_is_that_memory() -> No
     assert line.endswith("more than the learned policy; try task.memory=cell")
 
 
+@pytest.mark.parametrize("typed", ["algo", "collector"])
+def test_the_advice_of_more_frames_is_about_the_option_that_is_in_force(typed: str) -> None:
+    config = compose("train", {"algo": "a2c", f"{typed}.total_frames": 51200})
+    (line,) = poor(config, 1.0, {"Q_MDP": 0.5}, 0.1, small_world())
+    assert f"; try more {typed}.total_frames, algo=a2c_per_sensor or" in line
+
+
 @pytest.mark.parametrize("algo", ["a2c_per_sensor", "hindsight"])
 @pytest.mark.parametrize("memory", ["cell", "displacement"])
 @pytest.mark.parametrize("hides", [True, False])
