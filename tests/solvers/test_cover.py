@@ -115,6 +115,43 @@ def test_sets_and_bounds_of_coverage_problems(seed: int, misses: bool) -> None:
         assert worth(other).sum() - worth(start).sum() == pytest.approx(change, abs=1e-12)
 
 
+@pytest.mark.parametrize("listed", [0, 2, 14])
+@pytest.mark.parametrize("seed", range(6))
+def test_sets_are_the_best_whether_listed_or_solved_for(
+    seed: int, listed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows of at most `listed` sensors have all their sets gone through, the others integer programs."""
+    rng, choice = np.random.default_rng(seed), one_move(footprint_world(seed))
+    gain, price = rng.random(choice.sees.shape[1]), 0.8 * rng.random(len(choice.rows))
+    monkeypatch.setattr("trackmdp.sensing.cover._LISTED", listed)
+    found, most = choice.cover(gain, price, exact=True), most_of(choice, gain, price)
+    worth = choice.worth(found.on[:, None] > 0, gain[:, None], price[:, None])[:, 0]
+    assert worth == pytest.approx(most, abs=1e-9)
+    assert found.upper == pytest.approx(most, abs=1e-9)
+
+
+@pytest.mark.parametrize("misses", [False, True])
+@pytest.mark.parametrize("seed", range(6))
+def test_a_good_set_depends_on_no_other_row_or_candidate(seed: int, misses: bool) -> None:
+    """Rows and candidates that are settled are left out of the further changes of the others."""
+    rng, world = np.random.default_rng(seed), footprint_world(seed)
+    choice = one_move(replace(world, detection=0.8) if misses else world)
+    gain = rng.normal(0.3, 0.4, (choice.sees.shape[1], 8)) * world.kernel.data[:, None]
+    price = np.tile((0.2 * rng.random(len(choice.rows)))[:, None], 8)
+    start = rng.random(price.shape) < 0.5
+    on = choice.best(gain, price, start)
+    for row in range(choice.count):
+        mine = np.flatnonzero(choice.rows == row)
+        entries = np.unique(choice.sees[mine].indices)
+        alone = choice.part(mine, entries, np.array([row]))
+        for column in range(8):
+            each = [column]
+            found = alone.best(
+                gain[np.ix_(entries, each)], price[np.ix_(mine, each)], start[np.ix_(mine, each)]
+            )
+            assert (found[:, 0] == on[mine, column]).all()
+
+
 @pytest.mark.parametrize("limit", [{"_LISTED": 1}, {"_MOST_SETS": 5}, {"_AT_ONCE": 8}], ids=str)
 @pytest.mark.parametrize("seed", range(6))
 def test_sets_of_many_sensors_that_miss(

@@ -26,7 +26,7 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.entries import per_row, ranks, row_index, summing, with_data
+from trackmdp.arrays.entries import among, per_row, ranks, row_index, summing, with_data
 from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.sensing.choose import TIE, Cover
@@ -34,7 +34,7 @@ from trackmdp.sensing.programs import PROVED, integer, relaxed
 from trackmdp.sensing.task import Task
 
 _LISTED, _MOST_SETS, _AT_ONCE = 14, 2**22, 2**18
-"""Sensors of a row that may miss, up to which all sets are gone through; sets of all rows, and how many at once."""
+"""Sensors of a row up to which all sets are gone through; sets of all rows, and how many at once."""
 _MOST = 2**26
 """Sensors that see the entries of a step, entry by entry: some 5 GB."""
 _CERTAIN = 1.0 - 2.0**-53
@@ -173,8 +173,21 @@ class Shared:
         kept = self.distinct(price[:, 0])
         if len(kept) < len(price):
             on = np.zeros(price.shape, dtype=bool)
-            on[kept] = self.some(kept).greedy(gain, price[kept])
+            mark = kept.tobytes()
+            if mark not in self._parts:  # prices of a row hardly ever change their order
+                self._parts.clear()
+                self._parts[mark] = self.some(kept)
+            on[kept] = self._parts[mark]._from_both(gain, price[kept])
             return on
+        return self._from_both(gain, price)
+
+    @cached_property
+    def _parts(self) -> dict[bytes, Shared]:
+        """The last of `some` decisions that `greedy` chose from, by their numbers."""
+        return {}
+
+    def _from_both(self, gain: Array, price: Array) -> BoolArray:
+        """`greedy` of all the decisions."""
         none = self._add_drop(np.zeros(price.shape, dtype=bool), gain, price)
         every = self._add_drop(self.sees @ np.maximum(gain, 0.0) > price, gain, price)
         return self._better(none, every, gain, price)
@@ -184,9 +197,12 @@ class Shared:
         better = self.worth(other, gain, price) > self.worth(one, gain, price)
         return np.where(better[self.rows], other, one)
 
-    def _add_drop(self, on: BoolArray, gain: Array, price: Array) -> BoolArray:
-        """Every row takes the one change that gains it most, until none gains."""
-        tie = TIE * float(np.abs(gain).max(initial=0.0) + price.max(initial=0.0))
+    def _add_drop(
+        self, on: BoolArray, gain: Array, price: Array, tie: float | None = None
+    ) -> BoolArray:
+        """Every row takes the one change that gains it most, until none gains more than `tie`."""
+        if tie is None:
+            tie = TIE * float(np.abs(gain).max(initial=0.0) + price.max(initial=0.0))
         first = np.flatnonzero(np.diff(self.rows, prepend=-1))
         lengths = np.diff(first, append=len(self.rows))
         on, place = on.copy(), np.arange(len(self.rows))[:, None]
@@ -195,11 +211,25 @@ class Shared:
             best = np.maximum.reduceat(change, first, axis=0)
             tied = np.where(change >= np.repeat(best, lengths, axis=0), place, len(place))
             chosen = np.minimum.reduceat(tied, first, axis=0)  # of several equal ones the first
-            row, column = np.nonzero(best > tie)
+            gains = best > tie
+            row, column = np.nonzero(gains)
             if not len(row):
                 break
             where = chosen[row, column], column
             on[where] = ~on[where]
+            # Rows and candidates where nothing gained are settled: once the others are few, only these go on.
+            moved, wide = np.flatnonzero(gains.any(axis=1)), np.flatnonzero(gains.any(axis=0))
+            if 2 * len(moved) * len(wide) < best.size:
+                plans = self.rows[first[moved]]
+                kept = np.flatnonzero(among(plans, self.rows)[1])
+                entries = np.flatnonzero(np.bincount(self.sees[kept].indices))
+                gain, price = (
+                    np.broadcast_to(each, (len(each), on.shape[1]))[np.ix_(some, wide)]
+                    for each, some in ((gain, entries), (price, kept))
+                )
+                here, left = np.ix_(kept, wide), self.part(kept, entries, plans)
+                on[here] = left._add_drop(on[here], gain, price, tie)
+                break
         return on
 
     def distinct(self, price: Array) -> IndexArray:
@@ -234,16 +264,16 @@ class Shared:
     def cover(self, gain: Array, price: Array, *, exact: bool = False) -> Cover:
         """The linear program of each row, of gains `[E]` and prices `[G]`; sets alone where `exact`.
 
-        All rows make one program, which falls apart into theirs; `exact` solves those with fractions, few if any, as
-        integer programs. Of up to fourteen sensors that may miss all sets are gone through; where there are more the
-        sets are good ones, and only the bound is proved.
+        All rows make one program, which falls apart into theirs; of those with fractions, few if any, `exact` goes
+        through all sets of up to fourteen sensors, and solves the others as integer programs. Where sensors may miss
+        all sets are gone through at once; of more than fourteen the sets are good ones, and only the bound is proved.
         """
         # A sensor is in no solution if all its entries together gain no more than its price.
         use = self.distinct(price)
         use = use[self.sees[use] @ np.maximum(gain, 0.0) > price[use]]
         if not exact:
             return self._relaxed(use, gain, price)
-        few = self._few(use)
+        few = np.zeros(self.count, dtype=bool) if self.perfect else self._few(use)
         sets, upper = self._of_all(use[few[self.rows[use]]], gain, price)
         if not few.all():
             relaxed = self._relaxed(use[~few[self.rows[use]]], gain, price)
@@ -275,8 +305,6 @@ class Shared:
     def _few(self, use: IndexArray) -> BoolArray:
         """`[K]`, whether all sets of the decisions `use` of a row are gone through."""
         width = np.bincount(self.rows[use], minlength=self.count)
-        if self.perfect:
-            return width == 0
         order = np.argsort(width, kind="stable")
         few = width <= _LISTED
         few[order] &= np.cumsum(2.0 ** width[order]) <= _MOST_SETS
@@ -326,7 +354,12 @@ class Shared:
         left = upper - self.worth(sets, column, paid)[:, 0]
         kept = self.distinct(price)
         if self.perfect:
-            for row in np.flatnonzero(left > PROVED * np.maximum(upper, 1e-3)):
+            unproved = left > PROVED * np.maximum(upper, 1e-3)
+            few = self._few(kept[unproved[self.rows[kept]]]) & unproved
+            listed, most = self._of_all(kept[few[self.rows[kept]]], gain, price)
+            other[few[self.rows], 0] = listed[few[self.rows]]
+            upper[few] = np.minimum(upper, most)[few]
+            for row in np.flatnonzero(unproved & ~few):
                 mine = kept[self.rows[kept] == row]
                 other[mine, 0], proved = integer(self.sees[mine], gain, price[mine])
                 upper[row] = min(upper[row], proved)
