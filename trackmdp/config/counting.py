@@ -25,6 +25,7 @@ class ModelBasedConfig(EveryTaskConfig):
     """
 
     knows_budget = True
+    plans_at_end = True
     sensing: str | None = option(
         "all sensors on, or sets chosen by posterior sampling; null: all, with cost.budget chosen",
         choices=("all", "chosen"),

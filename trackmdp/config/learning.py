@@ -72,6 +72,8 @@ class AlgoConfig(ChoiceConfig):
     """Whether no more sensors than the budget are on, also while learning."""
     joint = False
     """Whether it learns of several targets together; else of a single one, and plans are merged."""
+    plans_at_end = False
+    """Whether its last iteration may take longer than all others together."""
     total_frames: int = count_option("env steps the algorithm needs", unit="frames", le=MOST_FRAMES)
     frames_per_batch: int = count_option("env steps per collected batch", unit="frames")
     envs: int = count_option("environments stepped together")

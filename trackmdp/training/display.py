@@ -22,8 +22,8 @@ from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.untrusted import printable
 
 _SECONDS_BETWEEN_LINES = 2.0
-_FIGURES_WIDTH = 60
-"""Columns of `300,000 frames AIHTR -2,985.00 gap 3,102.25 left 0:00:04`, and of the gaps between."""
+_FIGURES_WIDTH = 62
+"""Columns of `300,000 frames AIHTR -2,985.00 gap 3,102.25 left > 0:00:04`, and of the gaps between."""
 
 
 def make_console(quiet: bool) -> Console:
@@ -54,6 +54,8 @@ class _Console(Console):
 class Display(Callback):
     """Shows how far the run is and the figures of its last evaluation.
 
+    The time left takes the iterations to come for as long as those so far. Where the last one plans it is the least.
+
     Args:
         console: where; a bar at a terminal, else a line now and then.
         title: name of the run.
@@ -67,6 +69,7 @@ class Display(Callback):
         """Begin the bar where the run is; iterations of an earlier process do not count for the speed."""
         self._first = trainer.position
         self._started = self._last_line = time.monotonic()
+        self._least = trainer.config.algo.plans_at_end
         if self._console.is_terminal and not self._console.quiet:
             # The rest of the line after title, figures and time: a line that wraps scrolls at each refresh.
             room = self._console.width - len(self._title) - _FIGURES_WIDTH
@@ -75,7 +78,7 @@ class Display(Callback):
                 TextColumn("{task.description}"),
                 *bar,
                 TextColumn("{task.fields[figures]}"),
-                TextColumn("left"),
+                TextColumn("left >" if self._least else "left"),
                 TimeRemainingColumn(),
             )
             self._bar = Progress(*columns, console=self._console)
@@ -112,8 +115,9 @@ class Display(Callback):
             return
         self._last_line = now
         left = (now - self._started) / (iteration - first) * (iterations - iteration)
+        least = "at least " if self._least and iteration < iterations else ""
         self._console.print(
-            f"{self._title}: {100 * iteration // iterations:3d} %  {figures}  {left:,.0f} s left"
+            f"{self._title}: {100 * iteration // iterations:3d} %  {figures}  {least}{left:,.0f} s left"
         )
 
 
