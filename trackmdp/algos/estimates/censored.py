@@ -113,7 +113,8 @@ def expected_moves(
             later = _hidden(later, sensed[t])
             made = made + _pairs(forward[t], sparse.diags_array(weight) @ later, possible)
             # l_t(i) = sum_j P_ij l_{t+1}(j), with l zero where the cell was sensed: there it would have been detected.
-            later = (later @ moves.T).multiply(_support(forward[t]))
+            if t > 0:  # no move comes before the first one
+                later = (later @ backward[:m]).multiply(_support(forward[t]))
     return made.multiply(kernel)
 
 
