@@ -38,6 +38,8 @@ WORLDS: dict[str, Problem] = {
     "keys and misses": missing(memory="displacement_gap"),
     "mode": tm.make_world("heading", size=3, reveals=True, t_max=2),
     "footprints": footprint_world(3),
+    # Each cell but the first two is seen by two sensors, which both miss.
+    "faint footprints": missing(coverage=(np.eye(16) + np.eye(16, k=2)) * 0.6, safe_detection=0.6),
 }
 
 
@@ -222,7 +224,9 @@ def test_a_model_of_onnx_that_its_metadata_does_not_fit_is_refused_at_once(
         tm.Tracker(file, 0)
 
 
-@pytest.mark.parametrize("name", ["paper", "misses", "keys", "mode", "footprints"])
+@pytest.mark.parametrize(
+    "name", ["paper", "misses", "keys", "mode", "footprints", "faint footprints"]
+)
 def test_its_belief_is_that_of_the_log(name: str) -> None:
     """The log holds the belief after the move, before its report; one step earlier this is the tracker's, moved on."""
     world = WORLDS[name]
@@ -251,6 +255,8 @@ def test_belief_needs_a_motion() -> None:
         begun().belief()
     with pytest.raises(UserError, match="expected a World of 3 x 3 cells"):
         begun(world=WORLD)
+    with pytest.raises(UserError, match="expected a World of 3 x 3 cells and 9 sensors"):
+        begun(world=World(np.eye(9) * 0.9, 3, cost=0.1, coverage=np.ones((2, 9))))
     tracker = begun(world=small_world())
     for belief in ([1.0], ["x"] * 9, [[1 / 9]] * 9, [None] * 9, [float("nan")] * 9, [1e308] * 9, 3):
         state = tracker.state() | {"belief": belief}

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-from scipy import sparse
 
-from trackmdp.arrays.types import AnyArray, BoolArray, Indices
 from trackmdp.episodes.episode import Episode, Floats
-from trackmdp.policies.belief import BeliefFilter
-from trackmdp.sensing.coverage import reported
-from trackmdp.sensing.task import Task
+from trackmdp.policies.belief import BeliefFilter, reports
 from trackmdp.world.model import World
 
 
@@ -21,7 +17,7 @@ def beliefs(world: World, episodes: Sequence[Episode]) -> list[Floats]:
     A row sums to the probability of no exit. Each is the same to the bit for any other episodes. Targets with a mode
     are followed as (cell, mode), also through detections that do not reveal it.
     """
-    exact, told, chance = BeliefFilter(world.kernel, world.modes), world.tells_all, _reports(world)
+    exact, told, chance = BeliefFilter(world.kernel, world.modes), world.tells_all, reports(world)
     lengths = np.array([len(episode) for episode in episodes])
     first = np.cumsum(lengths) - lengths
     action, misses, target, located = (
@@ -49,20 +45,3 @@ def beliefs(world: World, episodes: Sequence[Episode]) -> list[Floats]:
         missed = exact.miss(predicted, chance(action[step], misses[step]))
         belief = np.where(seen[:, None], at, missed)
     return np.split(found, first[1:])
-
-
-def _reports(world: Task) -> Callable[[BoolArray, Indices], AnyArray]:
-    """Of actions `[B, S]` and n `[B]` the probability `[B, M]` that a step reports a target in each cell.
-
-    Where reports are certain it is the action itself, a bool. It is asked for step by step: of all steps at once it
-    would take 8 bytes for each step and cell, 3 GB for 400 steps on a million cells.
-    """
-    if world.perfect and world.safe:
-        return lambda action, _: world.covered(action)
-    seen_by = sparse.csr_array(world.sees_by_cell.T)
-
-    def chance(action: BoolArray, misses: Indices) -> AnyArray:
-        seen = reported(sparse.csr_array(action.astype(np.float64)), seen_by).toarray()
-        return np.where(misses[:, None] > world.t_max, world.safe_detection, seen)
-
-    return chance

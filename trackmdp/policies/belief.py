@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.types import AnyArray, Array, Indices
+from trackmdp.arrays.types import AnyArray, Array, BoolArray, Indices
+from trackmdp.sensing.coverage import reported
+from trackmdp.sensing.task import Task
 
 
 class BeliefFilter:
@@ -62,3 +66,20 @@ def _conditioned(weight: Array, otherwise: AnyArray) -> Array:
     chosen = np.where(weight.sum(axis=1, keepdims=True) > 0, weight, otherwise)
     # The least number keeps 0 / 0 out, of a target that has certainly left.
     return chosen / np.maximum(chosen.sum(axis=1, keepdims=True), np.finfo(np.float64).tiny)
+
+
+def reports(world: Task) -> Callable[[BoolArray, Indices], AnyArray]:
+    """Of actions `[B, S]` and n `[B]` the probability `[B, M]` that a step reports a target in each cell.
+
+    Where reports are certain it is the action itself, a bool. It is asked for step by step: of all steps at once it
+    would take 8 bytes for each step and cell, 3 GB for 400 steps on a million cells.
+    """
+    if world.perfect and world.safe:
+        return lambda action, misses: world.covered(action) | (misses > world.t_max)[:, None]
+    seen_by = sparse.csr_array(world.sees_by_cell.T)
+
+    def chance(action: BoolArray, misses: Indices) -> AnyArray:
+        seen = reported(sparse.csr_array(action.astype(np.float64)), seen_by).toarray()
+        return np.where(misses[:, None] > world.t_max, world.safe_detection, seen)
+
+    return chance

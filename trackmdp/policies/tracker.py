@@ -12,7 +12,7 @@ import numpy as np
 from trackmdp.arrays.numbers import whole_number
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
-from trackmdp.policies.belief import BeliefFilter
+from trackmdp.policies.belief import BeliefFilter, reports
 from trackmdp.policies.following import Following, probabilities
 from trackmdp.policies.onnx_table import OnnxTable
 from trackmdp.policies.saved import load_policy
@@ -49,7 +49,7 @@ class Tracker(Following):
 
     Raises:
         UserError: the cell or position is outside the grid; the mode is missing, or given where detections do not
-            reveal it; the file holds no policy; or the world is of another grid.
+            reveal it; the file holds no policy; or the world is of another grid or other sensors.
 
     Example:
         >>> from trackmdp import Policy, make_world
@@ -135,9 +135,10 @@ class Tracker(Following):
             if mode is not None:
                 raise UserError(f"report: mode={mode} without a cell, expected none")
             if self._filter is not None:
-                chance = self._world.safe_detection if self.safe else self._world.detection
-                predicted = self._filter.predict(self._belief)
-                self._belief = self._filter.miss(predicted, (self._seen() * chance)[None])
+                action = np.zeros((1, self._task.total_sensors), dtype=bool)
+                action[0, self._on] = True
+                chance = reports(self._world)(action, np.array([self.misses]))
+                self._belief = self._filter.miss(self._filter.predict(self._belief), chance)
             # The clock stands still where the safe action misses.
             self.misses = min(self.misses + 1, self._task.num_choices)
         else:
@@ -244,11 +245,15 @@ def _plan(policy: Plan | str | Path) -> Plan:
 
 
 def _checked(world: Any, task: Task) -> Any:
-    """The world, where it has a motion and is of the grid of a task.
+    """The world, where it has a motion and is of the grid and the sensors of a task.
 
     Raises:
         UserError: it has none, or is not.
     """
-    if world is not None and (not hasattr(world, "kernel") or world.size != task.size):
-        raise UserError(f"tracker: world: expected a World of {task.rows} x {task.columns} cells")
+    expected = task.size, task.total_sensors
+    if world is not None and (
+        not hasattr(world, "kernel") or (world.size, world.total_sensors) != expected
+    ):
+        grid = f"{task.rows} x {task.columns} cells"
+        raise UserError(f"tracker: world: expected a World of {grid} and {expected[1]} sensors")
     return world
