@@ -14,10 +14,12 @@ from tests.tracks import by_hand, drawn, recorded
 from trackmdp.app.cli import main
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import MOST_LINES
+from trackmdp.recordings.tracks import Recorded
 from trackmdp.solvers.value import replay
 from trackmdp.statistics import MeanInterval, mean_over_groups
 from trackmdp.training.compare import FIGURES, Compared, Comparison
 from trackmdp.training.evaluator import ESTIMATED, HeldOutEvaluator
+from trackmdp.world.model import World
 
 WORLD = small_world(exit_probability=0.05)
 FEW = {"total_frames": 2000, "frames_per_batch": 1000, "envs": 50}
@@ -58,6 +60,13 @@ def test_differences_on_tracks_are_paired_over_targets() -> None:
     same = tm.compare(problem, {"a": clocked, "b": clocked}).sentences[0]
     assert same.startswith("No difference between b and a is shown")
     assert none.difference.mean == 0.0
+
+
+@pytest.mark.parametrize("problem", [WORLD, recorded(by_hand([0, 1, 2], [4, 3], [8, 7, 4]))])
+def test_sets_in_an_array_are_a_policy(problem: World | Recorded) -> None:
+    sets = tm.Policy.all_on(problem).dense()
+    first, second = tm.compare(problem, ["all_on", sets]).policies
+    assert first.figures == second.figures
 
 
 def test_q_mdp_on_tracks_is_that_of_the_kernel_estimated_from_them() -> None:

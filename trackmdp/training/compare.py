@@ -202,7 +202,7 @@ def _made(problem: Subject, policies: Mapping[str, Any], make: Callable[[Any], M
     for name, policy in policies.items():
         try:
             # Q_MDP needs a motion model; on recorded tracks it has the kernel estimated from them.
-            if policy == "qmdp" and problem.recorded is not None:
+            if isinstance(policy, str) and policy == "qmdp" and problem.recorded is not None:
                 policy = estimated_qmdp(problem.recorded)
             found[name] = make(policy)
         except UserError as error:
