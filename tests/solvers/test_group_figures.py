@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
+from trackmdp.arrays.types import Array
+from trackmdp.solvers.several import group_value
 from trackmdp.solvers.several.group_figures import GroupEvaluation
 
 
@@ -21,6 +25,27 @@ def test_intervals_of_few_episodes_cover_what_they_say(count: int) -> None:
         assert found.high is not None
         covered += found.low <= 7.5 <= found.high
     assert 0.91 < covered / 400 < 0.98
+
+
+def test_intervals_that_are_soon_as_narrow_as_wanted_cover_what_they_say(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Rewards with a tail, 2 on average with a spread of 1; a width that some 64 episodes have, by luck fewer."""
+    rng = np.random.default_rng(3)
+
+    def drawn(rule: Any, episodes: int, *_: Any) -> Array:
+        totals = rng.normal(size=(episodes, 7))
+        totals[:, 0] = 1.0 + rng.exponential(size=episodes)
+        return totals
+
+    monkeypatch.setattr(group_value, "simulated", drawn)
+    covered = 0
+    for seed in range(2000):
+        found = group_value._played(Any, (1.0, (0.0, 0.0)), 1.96 / 8, seed, None).aihtr
+        assert found.low is not None
+        assert found.high is not None
+        covered += found.low <= 2.0 <= found.high
+    assert 0.935 < covered / 2000 < 0.965
 
 
 def test_two_episodes_have_no_interval() -> None:

@@ -23,8 +23,9 @@ from trackmdp.solvers.several.merging import Rule
 from trackmdp.solvers.several.simulation import Moving, group_steps
 from trackmdp.world.group import Group
 
-_FIRST = 64
-"""Episodes of the first batch, from which the number needed for the wanted width is worked out."""
+_FIRST = 256
+"""Episodes of the first batch, from which the number needed for the wanted width is worked out. From 64 the width may
+be met by luck: 92 of 100 intervals cover."""
 _AT_ONCE = 2**13
 """Targets of all episodes of a batch, at most."""
 _MOST = 2**17
