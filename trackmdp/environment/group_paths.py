@@ -121,8 +121,7 @@ class Walks:
 
     def ended(self) -> BoolArray:
         """`[E]`, whether an episode ends here."""
-        found: BoolArray = self._paths.ended(self._place).numpy()
-        return found
+        return np.asarray(self._paths.ended(self._place))
 
 
 class TrackMembers(RecordedTargets):
