@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from trackmdp.episodes.episode import Episode, Floats
-from trackmdp.policies.belief import BeliefFilter, reports
+from trackmdp.policies.belief import BeliefFilter, Reports
 from trackmdp.world.model import World
 
 
@@ -17,7 +17,7 @@ def beliefs(world: World, episodes: Sequence[Episode]) -> list[Floats]:
     A row sums to the probability of no exit. Each is the same to the bit for any other episodes. Targets with a mode
     are followed as (cell, mode), also through detections that do not reveal it.
     """
-    exact, told, chance = BeliefFilter(world.kernel, world.modes), world.tells_all, reports(world)
+    exact, told, chance = BeliefFilter(world.kernel, world.modes), world.tells_all, Reports(world)
     lengths = np.array([len(episode) for episode in episodes])
     first = np.cumsum(lengths) - lengths
     action, misses, target, located = (

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from scipy import sparse
 
@@ -68,18 +66,25 @@ def _conditioned(weight: Array, otherwise: AnyArray) -> Array:
     return chosen / np.maximum(chosen.sum(axis=1, keepdims=True), np.finfo(np.float64).tiny)
 
 
-def reports(world: Task) -> Callable[[BoolArray, Indices], AnyArray]:
-    """Of actions `[B, S]` and n `[B]` the probability `[B, M]` that a step reports a target in each cell.
+class Reports:
+    """The probability that a step reports a target in each cell.
 
-    Where reports are certain it is the action itself, a bool. It is asked for step by step: of all steps at once it
-    would take 8 bytes for each step and cell, 3 GB for 400 steps on a million cells.
+    It is asked for step by step: of all steps at once it would take 8 bytes for each step and cell, 3 GB for 400 steps
+    on a million cells.
+
+    Args:
+        world: its sensors and its safe action.
     """
-    if world.perfect and world.safe:
-        return lambda action, misses: world.covered(action) | (misses > world.t_max)[:, None]
-    seen_by = sparse.csr_array(world.sees_by_cell.T)
 
-    def chance(action: BoolArray, misses: Indices) -> AnyArray:
-        seen = reported(sparse.csr_array(action.astype(np.float64)), seen_by).toarray()
-        return np.where(misses[:, None] > world.t_max, world.safe_detection, seen)
+    def __init__(self, world: Task) -> None:
+        self._world = world
+        certain = world.perfect and world.safe
+        self._seen_by = None if certain else sparse.csr_array(world.sees_by_cell.T)
 
-    return chance
+    def __call__(self, action: BoolArray, misses: Indices) -> AnyArray:
+        """`[B, M]`, of actions `[B, S]` and n `[B]`; bool where reports are certain."""
+        world, safe = self._world, (misses > self._world.t_max)[:, None]
+        if self._seen_by is None:
+            return world.covered(action) | safe
+        seen = reported(sparse.csr_array(action.astype(np.float64)), self._seen_by).toarray()
+        return np.where(safe, world.safe_detection, seen)

@@ -66,12 +66,15 @@ class Following(ABC):
 
     def _seen(self) -> BoolArray:
         """`[M]` whether a sensor that is on covers a cell."""
-        task = self._task
         if self._on is None or self.safe:
-            return np.full(task.num_cells, self._on is not None)
-        action = np.zeros(task.total_sensors, dtype=bool)
-        action[self._on] = True
-        return task.covered(action)
+            return np.full(self._task.num_cells, self._on is not None)
+        return self._task.covered(self._action())
+
+    def _action(self) -> BoolArray:
+        """`[S]` whether each sensor is on."""
+        action = np.zeros(self._task.total_sensors, dtype=bool)
+        action[self._on or []] = True
+        return action
 
     def _check_followed(self, call: str) -> None:
         if self._exited:
@@ -105,16 +108,12 @@ class Following(ABC):
         return keys | {"sensors": self._task.total_sensors}
 
     def _check_state(self, state: Any) -> None:
-        """Check that a state has the parts of this tracker's, and is of the same facts.
-
-        Raises:
-            UserError: it has or is not.
-        """
+        """Raise a `UserError` unless a state has the parts of this tracker's, and is of the same facts."""
         expected = self.state()
         if not isinstance(state, Mapping) or set(state) != set(expected):
             raise UserError(f"state: expected a dict with {', '.join(sorted(expected))}")
-        if state["task"] != self._facts():
-            raise UserError(f"state: made for {state['task']}, expected {self._facts()}")
+        if state["task"] != expected["task"]:
+            raise UserError(f"state: made for {state['task']}, expected {expected['task']}")
 
     @abstractmethod
     def state(self) -> dict[str, Any]:

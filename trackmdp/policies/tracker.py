@@ -12,7 +12,7 @@ import numpy as np
 from trackmdp.arrays.numbers import whole_number
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
-from trackmdp.policies.belief import BeliefFilter, reports
+from trackmdp.policies.belief import BeliefFilter, Reports
 from trackmdp.policies.following import Following, probabilities
 from trackmdp.policies.onnx_table import OnnxTable
 from trackmdp.policies.saved import load_policy
@@ -75,9 +75,11 @@ class Tracker(Following):
         world: Any = None,
     ) -> None:
         self._policy = _plan(policy)
-        self._task, self._world = self._policy.task, _checked(world, self._policy.task)
+        self._task = self._policy.task
+        _check_world(world, self._task)
         self.key, self.misses, self.steps = 0, 0, 0
         self._filter = None if world is None else BeliefFilter(world.kernel, world.modes)
+        self._reports = None if world is None else Reports(world)
         self._belief: Array = np.zeros((1, 0))  # [1, Z] where the motion is known
         self.seed = whole_number("tracker: seed", seed, 0)
         found = self._one("tracker", cell, at)
@@ -134,10 +136,8 @@ class Tracker(Following):
         if cell is None:
             if mode is not None:
                 raise UserError(f"report: mode={mode} without a cell, expected none")
-            if self._filter is not None:
-                action = np.zeros((1, self._task.total_sensors), dtype=bool)
-                action[0, self._on] = True
-                chance = reports(self._world)(action, np.array([self.misses]))
+            if self._filter is not None and self._reports is not None:
+                chance = self._reports(self._action()[None], np.array([self.misses]))
                 self._belief = self._filter.miss(self._filter.predict(self._belief), chance)
             # The clock stands still where the safe action misses.
             self.misses = min(self.misses + 1, self._task.num_choices)
@@ -244,8 +244,8 @@ def _plan(policy: Plan | str | Path) -> Plan:
     return OnnxTable(policy) if kind == ".onnx" else load_policy(Path(policy))[0]
 
 
-def _checked(world: Any, task: Task) -> Any:
-    """The world, where it has a motion and is of the grid and the sensors of a task.
+def _check_world(world: Any, task: Task) -> None:
+    """Check that a world, where there is one, has a motion and is of the grid and the sensors of a task.
 
     Raises:
         UserError: it has none, or is not.
@@ -256,4 +256,3 @@ def _checked(world: Any, task: Task) -> Any:
     ):
         grid = f"{task.rows} x {task.columns} cells"
         raise UserError(f"tracker: world: expected a World of {grid} and {expected[1]} sensors")
-    return world
