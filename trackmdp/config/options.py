@@ -155,8 +155,8 @@ def refuse(key: str, value: object, expected: str) -> UserError:
         return UserError(
             f"{key}: the text '{value}', expected {expected} (from the environment: {how})"
         )
-    if isinstance(value, float) and "integer" not in expected:
-        value = f"{value:.15g}" if value.is_integer() else value  # 400 was read as 400.0
+    if isinstance(value, float) and value.is_integer() and "integer" not in expected:
+        value = f"{value:.15g}"  # 400 was read as 400.0
     text = "null" if value is None else " ".join(str(value).split())
     return UserError(
         f"{key}={textwrap.shorten(text, 200, placeholder=' ...')}: expected {expected}"
