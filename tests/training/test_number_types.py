@@ -1,0 +1,44 @@
+"""Checkpoints with numbers of other types than those of the run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from tests.training.runs import train
+from tests.training.test_state import forged
+from trackmdp.app.cli import main
+from trackmdp.training import checkpoint
+
+
+def as_type(state: Any, kind: torch.dtype) -> Any:
+    """A state with all of its floating-point tensors of another type."""
+    if isinstance(state, dict):
+        return {name: as_type(part, kind) for name, part in state.items()}
+    return (
+        state.to(kind)
+        if isinstance(state, torch.Tensor) and state.dtype.is_floating_point
+        else state
+    )
+
+
+@pytest.mark.parametrize(
+    ("algo", "part"),
+    [("ppo", "policy"), ("dqn", "loss"), ("dqn", "buffer"), ("hindsight", "learner")],
+)
+@pytest.mark.parametrize("kind", [torch.float64, torch.complex64])
+def test_numbers_of_another_type_are_refused_in_one_line(
+    algo: str, part: str, kind: torch.dtype, tmp_path: Path, capfd: Any
+) -> None:
+    """Not in a traceback of the first update, nor after a warning of torch's that imaginary parts are lost."""
+    train(tmp_path / "run", algo=algo)
+    state = checkpoint.load(checkpoint.newest(tmp_path / "run"))["algorithm"]
+    forged(tmp_path / "run", algorithm={**state, part: as_type(state[part], kind)})
+    capfd.readouterr()
+    words = ["collector.total_frames=4096", "checkpoint.keep=1"]
+    assert main(["train", f"resume={tmp_path / 'run'}", *words]) == 2
+    error = capfd.readouterr().err
+    assert (len(error.splitlines()), f"{kind}, expected" in error) == (1, True)
