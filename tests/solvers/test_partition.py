@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -298,6 +300,27 @@ def test_what_comes_while_workers_start_is_heard_afterwards(kind: signal.Signals
         {signal.SIGINT, signal.SIGUSR1}
     ]  # which a worker inherits; by SIGTERM it is ended
     assert not signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+def test_a_signal_is_heard_also_where_a_worker_dies_of_it_first() -> None:
+    with handled(stop, signal.SIGTERM), pytest.raises(Preempted), workers._starting():
+        signal.raise_signal(signal.SIGTERM)
+        raise BrokenProcessPool
+
+
+@pytest.mark.slow
+def test_a_worker_may_die_while_jobs_are_handed_out(tmp_path: Path) -> None:
+    def job(number: int) -> int:
+        # the pool ends all of its workers once one has died
+        while number == 4 and multiprocessing.active_children() and not gone:
+            pass
+        gone.extend([True] if number == 4 else [])
+        return number
+
+    gone: list[bool] = []
+    with crew(2) as run:
+        assert run(Dies(tmp_path), workers.Made(6, job)) == [0, 1, 4, 9, 16, 25]
+    assert gone and (tmp_path / "killed").exists()
 
 
 @pytest.mark.slow

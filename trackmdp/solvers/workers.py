@@ -87,11 +87,12 @@ def _processes(workers: int) -> Iterator[Crew]:
         for _ in range(_ATTEMPTS):
             left = [number for number in range(len(jobs)) if number not in results]
             futures = dict[int, Future[Result]]()
-            for number in left:
-                with _starting():
-                    futures[number] = pool.submit(_done, work, jobs[number])
+            # a worker died: all unfinished jobs are run again
+            with suppress(BrokenProcessPool):
+                for number in left:
+                    with _starting():
+                        futures[number] = pool.submit(_done, work, jobs[number])
             for number, future in futures.items():
-                # a worker died: all unfinished jobs are run again
                 with suppress(BrokenProcessPool):
                     results[number] = future.result()
             if len(results) == len(jobs):
@@ -137,8 +138,8 @@ def _starting() -> Iterator[None]:
             yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    for number in heard:
-        signal.raise_signal(number)
+        for number in heard:  # also where a worker has died of it already
+            signal.raise_signal(number)
 
 
 def _done(work: Callable[[Piece], Result], job: Piece) -> Result:
