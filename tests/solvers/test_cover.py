@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.helpers import random_kernel, small_world
-from tests.solvers.worlds import best_of_all, footprint_world
+from tests.solvers.worlds import all_plans, best_of_all, followed, footprint_world
 from trackmdp.arrays.entries import row_index
 from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.recordings.tracks import Tracks
+from trackmdp.sensing.choose import largest
 from trackmdp.sensing.cover import Shared
 from trackmdp.sensing.decisions import sensing
 from trackmdp.solvers import bounds, lookahead, optimal, rules
@@ -23,6 +25,14 @@ from trackmdp.solvers.value import replay
 from trackmdp.world.model import World
 
 PLANNERS = (rules.clocked_policy, rules.qmdp, rules.fcr, rules.myopic)
+
+
+def later(since: int, end: int, step: int = 1) -> list[Any]:
+    """Cases that are left to the slow tests."""
+    return [pytest.param(each, marks=pytest.mark.slow) for each in range(since, end, step)]
+
+
+BUDGETS = [None, 1, *later(0, 4, 2)]
 
 
 def one_move(world: World) -> Shared:
@@ -40,6 +50,11 @@ def from_cell_0(coverage: list[list[int]], cost: list[float]) -> World:
     return World(kernel, (1, len(kernel)), cost=cost, t_max=0, safe_cost=1.0, coverage=coverage)
 
 
+def most_on(choice: Shared, on: Array) -> int:
+    """The most sensors on in a row."""
+    return int(np.bincount(choice.rows, weights=on.ravel() > 0).max())
+
+
 def most_of(choice: Shared, gain: Array, price: Array) -> Array:
     """`[M]`, the best of all sets of each row."""
     best = np.zeros(choice.count)
@@ -48,6 +63,8 @@ def most_of(choice: Shared, gain: Array, price: Array) -> Array:
         unseen = 1.0 - choice.sees[mine].toarray()
         for number in range(2 ** len(mine)):
             on = (number >> np.arange(len(mine))) & 1 > 0
+            if choice.budget is not None and on.sum() > choice.budget:
+                continue
             seen = 1.0 - unseen[on].prod(axis=0)
             best[row] = max(best[row], gain @ seen - price[mine][on].sum())
     return best
@@ -82,11 +99,12 @@ def test_of_sensors_that_see_the_same_the_cheapest_counts(monkeypatch: pytest.Mo
         one_move(world)
 
 
+@pytest.mark.parametrize("budget", BUDGETS)
 @pytest.mark.parametrize("misses", [False, True])
-@pytest.mark.parametrize("seed", range(20))
-def test_sets_and_bounds_of_coverage_problems(seed: int, misses: bool) -> None:
+@pytest.mark.parametrize("seed", [*range(8), *later(8, 20)])
+def test_sets_and_bounds_of_coverage_problems(seed: int, misses: bool, budget: int | None) -> None:
     """Some gains are losses: cells that a set must not see."""
-    rng, world = np.random.default_rng(seed), footprint_world(seed)
+    rng, world = np.random.default_rng(seed), footprint_world(seed).but(budget=budget)
     if misses:
         world = replace(world, detection=rng.uniform(0.5, 0.9, world.num_cells))
     choice = one_move(world)
@@ -103,8 +121,14 @@ def test_sets_and_bounds_of_coverage_problems(seed: int, misses: bool) -> None:
     good, start = worth(choice.greedy(*columns)), rng.random((len(price), 1)) < 0.5
     assert (good <= most + 1e-12).all()
     assert good.sum() >= 0.9 * most.sum()
-    better = worth(choice.best(*columns, start))
-    assert (better >= np.maximum(good, worth(start)) - 1e-12).all()
+    found = choice.best(*columns, start)
+    few = start if budget is None else start & largest(choice.rows, start.astype(float), budget)
+    assert (worth(choice.best(*columns, few)) >= np.maximum(good, worth(few)) - 1e-12).all()
+    assert (worth(found) >= good - 1e-12).all()
+    if budget is not None:
+        assert (
+            max(most_on(choice, on) for on in (found, exact.on, choice.greedy(*columns))) <= budget
+        )
     assert exact.upper == pytest.approx(most, abs=1e-9)
     assert worth(exact.on) == pytest.approx(most, abs=1e-9)
     # Each sensor switched over by itself.
@@ -115,13 +139,15 @@ def test_sets_and_bounds_of_coverage_problems(seed: int, misses: bool) -> None:
         assert worth(other).sum() - worth(start).sum() == pytest.approx(change, abs=1e-12)
 
 
+@pytest.mark.parametrize("budget", BUDGETS)
 @pytest.mark.parametrize("listed", [0, 2, 14])
 @pytest.mark.parametrize("seed", range(6))
 def test_sets_are_the_best_whether_listed_or_solved_for(
-    seed: int, listed: int, monkeypatch: pytest.MonkeyPatch
+    seed: int, listed: int, budget: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Rows of at most `listed` sensors have all their sets gone through, the others integer programs."""
-    rng, choice = np.random.default_rng(seed), one_move(footprint_world(seed))
+    rng = np.random.default_rng(seed)
+    choice = one_move(footprint_world(seed).but(budget=budget))
     gain, price = rng.random(choice.sees.shape[1]), 0.8 * rng.random(len(choice.rows))
     monkeypatch.setattr("trackmdp.sensing.cover._LISTED", listed)
     found, most = choice.cover(gain, price, exact=True), most_of(choice, gain, price)
@@ -130,11 +156,14 @@ def test_sets_are_the_best_whether_listed_or_solved_for(
     assert found.upper == pytest.approx(most, abs=1e-9)
 
 
+@pytest.mark.parametrize("budget", BUDGETS)
 @pytest.mark.parametrize("misses", [False, True])
 @pytest.mark.parametrize("seed", range(6))
-def test_a_good_set_depends_on_no_other_row_or_candidate(seed: int, misses: bool) -> None:
+def test_a_good_set_depends_on_no_other_row_or_candidate(
+    seed: int, misses: bool, budget: int | None
+) -> None:
     """Rows and candidates that are settled are left out of the further changes of the others."""
-    rng, world = np.random.default_rng(seed), footprint_world(seed)
+    rng, world = np.random.default_rng(seed), footprint_world(seed).but(budget=budget)
     choice = one_move(replace(world, detection=0.8) if misses else world)
     gain = rng.normal(0.3, 0.4, (choice.sees.shape[1], 8)) * world.kernel.data[:, None]
     price = np.tile((0.2 * rng.random(len(choice.rows)))[:, None], 8)
@@ -188,10 +217,11 @@ def test_a_bracket_is_no_wider_than_to_the_clocked_bound(monkeypatch: pytest.Mon
     assert solution.upper < clocked - 0.1
 
 
+@pytest.mark.parametrize("budget", BUDGETS)
 @pytest.mark.parametrize("misses", [False, True])
-@pytest.mark.parametrize("seed", range(12))
-def test_bounds_and_planners_against_all_plans(seed: int, misses: bool) -> None:
-    world = footprint_world(seed)
+@pytest.mark.parametrize("seed", [*range(5), *later(5, 12)])
+def test_bounds_and_planners_against_all_plans(seed: int, misses: bool, budget: int | None) -> None:
+    world = footprint_world(seed).but(budget=budget)
     if misses:
         chances = np.random.default_rng(seed).uniform(0.5, 0.9, world.num_cells)
         world = replace(world, detection=chances)
@@ -205,7 +235,7 @@ def test_bounds_and_planners_against_all_plans(seed: int, misses: bool) -> None:
     assert (exact.value <= linear.value + 1e-7).all()
     short = replace(world, max_steps=4)
     most = bounds.clocked(short)
-    for plan in PLANNERS:
+    for plan in (*PLANNERS, lookahead.solve):
         assert (evaluate(world, plan(world)).value <= best + 1e-8).all()
         assert (evaluate(short, plan(short)).value <= most + 1e-8).all()
     solution = optimal.solve(world)
@@ -214,6 +244,22 @@ def test_bounds_and_planners_against_all_plans(seed: int, misses: bool) -> None:
     assert solution.certified
     if world.t_max == 0:  # one set from each cell: the bound that reveals the cell is the optimum
         assert exact.value == pytest.approx(best, abs=1e-7)
+
+
+@pytest.mark.parametrize("budget", BUDGETS)
+@pytest.mark.parametrize("seed", range(10))
+def test_sets_ahead_are_the_best_plans_of_small_worlds(seed: int, budget: int | None) -> None:
+    world = footprint_world(seed).but(budget=budget, t_max=1)
+    value, sets = bounds.clocked_table(world).table[:, 0], lookahead.solve(world).dense()
+    for z in range(world.num_cells):
+        most, worth = (
+            (earned + located @ value).max()
+            for earned, located, _ in (
+                all_plans(world, z),
+                followed(world, z, [sets[z, n][None] for n in range(2)]),
+            )
+        )
+        assert worth == pytest.approx(most, abs=1e-9)
 
 
 def test_footprints_of_one_cell_in_another_order_are_the_papers_sensors() -> None:
@@ -288,8 +334,6 @@ def test_recorded_tracks_are_replayed_with_footprints() -> None:
 
 def test_methods_that_need_a_sensor_a_cell() -> None:
     world = footprint_world(0)
-    with pytest.raises(UserError, match="expected clocked or optimal"):
-        lookahead.solve(world)
     with pytest.raises(UserError, match="block=2"):
         solve(world, block=2)
     with pytest.raises(UserError, match="one cell"):

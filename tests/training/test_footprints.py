@@ -42,6 +42,16 @@ def test_sets_of_sensors_are_learned_and_kept(algo: str, tmp_path: Path) -> None
     assert (again.policy.dense() == run.policy.dense()).all()
 
 
+@pytest.mark.parametrize("algo", ["a2c", "dqn", "model_based"])
+def test_a_budget_is_kept_to_by_sensors_that_share_cells(algo: str) -> None:
+    world = _world().but(budget=1)
+    run = tm.train(world, algo, **SHORT)
+    assert run.policy.dense().sum(axis=-1).max() == 1
+    assert (tm.simulate(world, run.policy, 100, seed=1).sensors <= 1).all()
+    if algo == "model_based":
+        assert run.evaluation.aihtr == pytest.approx(tm.solve(world).lower, rel=0.05)
+
+
 @pytest.mark.parametrize("collect", ["all_on", "mixed"])
 def test_moves_count_although_a_sensor_is_missing(collect: str) -> None:
     """Where others cover its cells, a step with all others on is fully sensed."""

@@ -100,9 +100,6 @@ class FcrConfig(BaselineConfig):
 class LookaheadConfig(BaselineConfig):
     """Plan some sets ahead, then count on a simpler value."""
 
-    knows_footprints = False
-    knows_budget = False
-
     depth: int = count_option("sets planned ahead", unit="steps", le=16)
     tail: str = option("value counted on after them", choices=("qmdp", "clocked"))
 

@@ -201,7 +201,6 @@ class FrontierConfig(WorldConfig):
     """
 
     all_prices = True
-    any_number = True
     task: TaskConfig
     solver: BaselineConfig
     accuracy: float | None = share_option(

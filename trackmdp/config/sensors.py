@@ -67,8 +67,6 @@ class PaperCostConfig(CostConfig):
         # Blocks settle what they share by trees, which decide on one cell at a time.
         by_blocks = partition is not None and partition.block is not None
         if self.budget is not None:
-            if root.sensor.covers:
-                raise refuse(f"{key}.budget", self.budget, f"null with sensor={root.sensor.name}")
             require_able(root, "knows_budget", f"with {key}.budget={self.budget}")
             if root.any_number or by_blocks:
                 expected = "null here, where any number of sensors is on"

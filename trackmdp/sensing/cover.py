@@ -15,12 +15,13 @@ proves
     sum_e z̄_e (g_e - lambda_e) + sum_s max(sum_e p_se lambda_e - c_s, 0)
 
 as an upper bound, for a solution of any solver: so the bounds here hold to rounding. Where g_e < 0, a report is a loss
-that a set has to take; the relaxation may leave it out (z_e = 0), which only raises the bound.
+that a set has to take; the relaxation may leave it out (z_e = 0), which only raises the bound. With a budget, sum_s x_s
+<= B, any mu >= 0 takes mu off the gain of each sensor in the second sum, and adds mu B.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -29,7 +30,7 @@ from scipy import sparse
 from trackmdp.arrays.entries import among, per_row, ranks, row_index, summing, with_data
 from trackmdp.arrays.types import AnyArray, Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
-from trackmdp.sensing.choose import TIE, Cover
+from trackmdp.sensing.choose import TIE, Cover, largest
 from trackmdp.sensing.programs import PROVED, integer, relaxed
 from trackmdp.sensing.task import Task
 
@@ -49,14 +50,16 @@ class Shared:
         rows, sensors: `[G]`, row and sensor of each decision, in order.
         count: K, rows.
         sees: `[G, E]` CSR, probability that the sensor of a decision reports an entry of its row.
+        budget: B, sensors that may be on in a row; None: all.
     """
 
     rows: IndexArray
     sensors: IndexArray
     count: int
     sees: sparse.csr_array
+    budget: int | None
 
-    allowed = budget = None
+    allowed = None
 
     @classmethod
     def of(
@@ -89,7 +92,7 @@ class Shared:
         numbers, number = np.unique(row * task.total_sensors + sensor, return_inverse=True)
         owner, sensor = np.divmod(numbers, task.total_sensors)
         sees = sparse.csr_array((data, (number, entry)), shape=(len(numbers), len(cells)))
-        return cls(owner, sensor, count, sees)
+        return cls(owner, sensor, count, sees, task.budget)
 
     @cached_property
     def perfect(self) -> bool:
@@ -200,18 +203,25 @@ class Shared:
     def _add_drop(
         self, on: BoolArray, gain: Array, price: Array, tie: float | None = None
     ) -> BoolArray:
-        """Every row takes the one change that gains it most, until none gains more than `tie`."""
+        """Every row takes the one change that gains it most, until none gains more than `tie`.
+
+        With more sensors on than the budget it drops those that cost least to drop.
+        """
         if tie is None:
             tie = TIE * float(np.abs(gain).max(initial=0.0) + price.max(initial=0.0))
         first = np.flatnonzero(np.diff(self.rows, prepend=-1))
         lengths = np.diff(first, append=len(self.rows))
         on, place = on.copy(), np.arange(len(self.rows))[:, None]
         while len(first):
-            change = self.changes(on, gain, price)
+            change, over = self.changes(on, gain, price), np.zeros(1, dtype=bool)
+            if self.budget is not None:
+                number = np.add.reduceat(on, first, axis=0, dtype=np.int64)
+                full = np.repeat(number >= self.budget, lengths, axis=0)
+                change, over = np.where(full & ~on, -np.inf, change), number > self.budget
             best = np.maximum.reduceat(change, first, axis=0)
             tied = np.where(change >= np.repeat(best, lengths, axis=0), place, len(place))
             chosen = np.minimum.reduceat(tied, first, axis=0)  # of several equal ones the first
-            gains = best > tie
+            gains = (best > tie) | over
             row, column = np.nonzero(gains)
             if not len(row):
                 break
@@ -241,13 +251,13 @@ class Shared:
 
     def some(self, kept: IndexArray) -> Shared:
         """Some of the decisions, on all entries."""
-        return Shared(self.rows[kept], self.sensors[kept], self.count, self.sees[kept])
+        return replace(self, rows=self.rows[kept], sensors=self.sensors[kept], sees=self.sees[kept])
 
     def part(self, kept: IndexArray, entries: IndexArray, rows: IndexArray) -> Shared:
         """See `Own`."""
         place = np.searchsorted(rows, self.rows[kept])
         sees = self.sees[kept][:, entries]
-        return Shared(place, self.sensors[kept], len(rows), sees)
+        return Shared(place, self.sensors[kept], len(rows), sees, self.budget)
 
     @cached_property
     def _kind(self) -> IndexArray:
@@ -291,13 +301,20 @@ class Shared:
         if len(use):
             if not self.perfect:
                 most -= self.some(use)._unreported(np.ones((len(use), 1), dtype=bool))[entries, 0]
-            on[use], worth = relaxed(sees, value, cost, most)
-            # The bound of the module's text: of the entries, and of the sensors.
+            limited, spare = (
+                self._sums[: 0 if self.budget is None else None, use],
+                np.zeros(self.count),
+            )
+            on[use], worth, mu = relaxed(sees, value, cost, most, limited, self.budget or 0)
+            spare[: len(mu)] = mu
+            # The bound of the module's text: of the entries, of the sensors, and of the budget.
             owner = np.zeros(len(entries), dtype=np.int64)
             pairs = sees.tocoo()
             owner[pairs.col] = self.rows[use][pairs.row]
             upper = per_row(owner, most * (value - worth), self.count)
-            upper += per_row(self.rows[use], np.maximum(sees @ worth - cost, 0.0), self.count)
+            net = sees @ worth - cost - spare[self.rows[use]]
+            upper += per_row(self.rows[use], np.maximum(net, 0.0), self.count)
+            upper += (self.budget or 0) * spare
         whole = np.ones(len(gain))
         whole[entries] = most
         return Cover(on, np.minimum(on @ self.sees, whole) * (gain > 0), upper)
@@ -339,6 +356,8 @@ class Shared:
         gains[owner, place] = gain[entries]
         # Set number 5 of three sensors has the first and the third: 5 = 1 + 4.
         sets = (np.arange(2**width)[:, None] >> np.arange(width)) & 1
+        if self.budget is not None:
+            sets = sets[sets.sum(axis=1) <= self.budget]
         unreported = np.exp(sets.astype(np.float64) @ dense)
         worth = ((1.0 - unreported) @ gains[:, :, None])[:, :, 0] - price[these] @ sets.T
         best = worth.argmax(axis=1)
@@ -349,7 +368,10 @@ class Shared:
     ) -> tuple[BoolArray, Array]:
         """Sets `[G]`, and their proved bound `[K]`: those of the linear program, or else of integer programs."""
         column, paid = gain[:, None], price[:, None]
-        sets = self._better(on[:, None] > 0.5, self.greedy(column, paid), column, paid)
+        near = on[:, None] > 0.5
+        if self.budget is not None:
+            near &= largest(self.rows, on[:, None], self.budget)
+        sets = self._better(near, self.greedy(column, paid), column, paid)
         other, upper = sets.copy(), upper.copy()
         left = upper - self.worth(sets, column, paid)[:, 0]
         kept = self.distinct(price)
@@ -361,6 +383,6 @@ class Shared:
             upper[few] = np.minimum(upper, most)[few]
             for row in np.flatnonzero(unproved & ~few):
                 mine = kept[self.rows[kept] == row]
-                other[mine, 0], proved = integer(self.sees[mine], gain, price[mine])
+                other[mine, 0], proved = integer(self.sees[mine], gain, price[mine], self.budget)
                 upper[row] = min(upper[row], proved)
         return self._better(sets, other, column, paid)[:, 0], upper

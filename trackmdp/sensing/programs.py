@@ -13,26 +13,40 @@ _SCALE = 1e5
 """The largest gain in an integer program."""
 
 
-def relaxed(sees: sparse.csr_array, gain: Array, price: Array, most: Array) -> tuple[Array, Array]:
-    """Shares `[G]` of the linear program, and lambda `[E]` in [0, gain]: the price of each entry's being reported."""
+def relaxed(
+    sees: sparse.csr_array,
+    gain: Array,
+    price: Array,
+    most: Array,
+    sums: sparse.csr_array,
+    budget: int,
+) -> tuple[Array, Array, Array]:
+    """Shares `[G]` of the linear program, and the prices of its limits.
+
+    These are lambda `[E]` in [0, gain], of each entry's being reported, and mu `[K]`, of the `budget` that each of the
+    `sums` `[K, G]` of shares keeps to.
+    """
     from scipy.optimize import linprog  # a tenth of a second to load
 
     p, e = sees.shape
     # Minimise price x - gain z; z_e - (sees^T x)_e <= 0.
-    constraint = sparse.hstack([-sees.T, sparse.eye_array(e)], format="csr")
+    constraint = sparse.block_array([[-sees.T, sparse.eye_array(e)], [sums, None]], format="csr")
     found = linprog(
         np.concatenate([price, -gain]),
         A_ub=constraint,
-        b_ub=np.zeros(e),
+        b_ub=np.repeat([0.0, budget], [e, sums.shape[0]]),
         bounds=np.stack([np.zeros(p + e), np.concatenate([np.ones(p), most])], axis=1),
         method="highs",
     )
     if found.status != 0:  # never seen; all on and no prices is a bound as well
-        return np.ones(p), np.zeros(e)
-    return np.clip(found.x[:p], 0.0, 1.0), np.clip(-found.ineqlin.marginals, 0.0, gain)
+        return np.ones(p), np.zeros(e), np.zeros(sums.shape[0])
+    limits = -found.ineqlin.marginals
+    return np.clip(found.x[:p], 0, 1), np.clip(limits[:e], 0, gain), np.maximum(limits[e:], 0)
 
 
-def integer(sees: sparse.csr_array, gain: Array, price: Array) -> tuple[BoolArray, float]:
+def integer(
+    sees: sparse.csr_array, gain: Array, price: Array, budget: int | None
+) -> tuple[BoolArray, float]:
     """The best set `[G]` of one row, where no sensor misses, and its proved bound."""
     from scipy.optimize import Bounds, LinearConstraint, milp  # as above
 
@@ -48,11 +62,13 @@ def integer(sees: sparse.csr_array, gain: Array, price: Array) -> tuple[BoolArra
     place = (np.tile(count, 2), np.concatenate([sensor, p + entry]))
     forced = sparse.csr_array((signs, place), shape=(len(count), p + e))
     union = sparse.hstack([-sees.T, sparse.eye_array(e)], format="csr")
+    few = sparse.csr_array(np.repeat([[1.0, 0.0]], [p, e], axis=1))
+    limits = np.append(np.zeros(e + len(count)), p if budget is None else min(budget, p))
     # HiGHS stops once the best set and its bound are within 1e-6: of numbers this much larger that is nothing.
     scale = _SCALE / max(float(gain.max(initial=0.0)), 1e-300)
     found = milp(
         scale * np.concatenate([price, -gain]),
-        constraints=LinearConstraint(sparse.vstack([union, forced], format="csr"), ub=0.0),
+        constraints=LinearConstraint(sparse.vstack([union, forced, few], format="csr"), ub=limits),
         integrality=np.concatenate([np.ones(p), np.zeros(e)]),
         bounds=Bounds(0, 1),
         options={"mip_rel_gap": 0.0},

@@ -141,10 +141,6 @@ class Task(Carded):
             if value is not None or name not in _NULLABLE:
                 value = whole_number(name, value, lowest, most)
             checked[name] = value
-        if checked["budget"] is not None and footprints is not None:
-            raise UserError(
-                f"budget={self.budget}: expected None with sensors that have footprints"
-            )
         for name, value in checked.items():
             object.__setattr__(self, name, value)  # the dataclass is frozen
 

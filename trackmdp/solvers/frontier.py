@@ -109,13 +109,10 @@ def trace(
     """`frontier` with the solver of a config.
 
     Raises:
-        UserError: there is no motion model, a step has a budget, episodes are cut, or the target is never in the grid
-            after its start.
+        UserError: there is no motion model, episodes are cut, or the target is never in the grid after its start.
     """
     check_problem(problem, "frontier")
     world = modelled(problem, "frontier")
-    if world.budget is not None:
-        raise UserError(f"budget={world.budget}: expected None, any number of sensors in a step")
     if world.max_steps is not None:
         raise UserError(
             f"grid.max_steps={world.max_steps}: only whole episodes are solved, expected null"

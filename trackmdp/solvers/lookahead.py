@@ -8,13 +8,13 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
-from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked_table, valid
 from trackmdp.solvers.certify.branch import Tree
 from trackmdp.solvers.certify.inner import InnerProblem
 from trackmdp.solvers.certify.known import adopted, first_guess, tables, up_to
 from trackmdp.solvers.exchange import exchange
+from trackmdp.solvers.optimal import has_trees
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.world.model import World
 
@@ -28,17 +28,13 @@ _MOST_NODES = 2_000_000
 def solve(world: World, *, depth: int = 2, tail: Tail = "clocked") -> PolicyTable:
     """The policy that plans `depth` sets at every info state, fewer where the safe action comes before.
 
+    The plans are the best ones; those of sensors that share cells or a budget are as good as exchange finds.
+
     Args:
         world: the problem.
         depth: sets planned, at least 1; 1 gives Q_MDP (with the in-grid factor) and the clocked policy.
         tail: the value after them: `qmdp`, the position known after every action, or `clocked`, U(j, n).
     """
-    if world.coverage is not None:
-        raise UserError(
-            "solver=lookahead: plans for sensors that each cover one cell; expected clocked or optimal"
-        )
-    if world.budget is not None:
-        raise UserError(f"solver=lookahead: expected another one with a budget, {world.budget}")
     world = World.of(world.remembering(), world.kernel)
     # [M, t_max + 2], worth of the target being known in a cell after n misses
     tails = (
@@ -65,9 +61,15 @@ def solve(world: World, *, depth: int = 2, tail: Tail = "clocked") -> PolicyTabl
 def _first_set(problem: InnerProblem, mass: Array, states: IndexArray) -> BoolArray:
     """`[G, 1]` the first set of the best plan from each located cell; `mass` `[E]` is undetected in `states` `[E]`."""
     world, run = problem.world, up_to(_MOST_NODES)
-    known = tables(problem, slack=_SLACK, run=run)
+    cellwise = has_trees(world)
+    # Without trees optimism is that of a search that is left after one more miss.
+    known = (
+        tables(problem, slack=_SLACK, run=run) if cellwise else [problem.missed] * problem.length
+    )
     plans, sets = first_guess(problem, known, mass)
     sets = exchange(plans, sets, np.ones(world.num_cells, dtype=bool))
+    if not cellwise:
+        return sets[0]
     # One problem per located cell: its undetected mass after the sets carried out so far.
     place = problem.turns[0].before, states
     here = sparse.csr_array((mass, place), shape=(world.num_cells, world.num_cells))

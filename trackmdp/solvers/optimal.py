@@ -94,7 +94,7 @@ def solve(
     if start is not None and start.task.num_keys != world.num_keys:
         start = None
     side = (
-        region_side(world, memory) if _has_trees(world) else None
+        region_side(world, memory) if has_trees(world) else None
     )  # there are no regions without one
     run = _Run(world, Budget(nodes, time_limit), tolerance, start, on_progress, side)
     interrupted = False
@@ -121,7 +121,7 @@ class _Run:
     def __post_init__(self) -> None:
         # U(z, 0) >= V*(z) before anything is searched; `tighten` only lowers it.
         self.bound = exact_clocked_table(self.world).value
-        self.trees = _has_trees(self.world)
+        self.trees = has_trees(self.world)
         if self.world.modes == 1:
             self.policy = clocked_policy(self.world)
         else:
@@ -372,7 +372,7 @@ class _Run:
         )
 
 
-def _has_trees(world: World) -> bool:
+def has_trees(world: World) -> bool:
     """Whether the tree, which decides on one cell at a time, can search the plans of a world."""
     return world.coverage is None and world.modes == 1 and world.budget is None
 

@@ -2,8 +2,8 @@
 
 Given the sets before it, the last set of a plan is a best answer (`choose`). So a row's best plan is found by going
 through the sets before: the subsets of the sensors in reach, one bit for each, or with a budget the small ones. Where
-sensors that never miss share cells only the cells covered by the first set matter: of all sets that cover the same
-ones the cheapest counts, and there are 2^Z such subsets of the Z successors.
+sensors that never miss share cells, without a budget, only the cells covered by the first set matter: of all sets that
+cover the same ones the cheapest counts, and there are 2^Z such subsets of the Z successors.
 
 Most choices need not be followed: with the state revealed after the listed sets they would be worth less than the plan
 at hand.
@@ -90,7 +90,8 @@ def _choices(plans: Plans) -> _Choices | None:
     if not turns:
         return _Choices(1, lambda _: ([], []), lambda _: [])
     first = choices[0]
-    if not (isinstance(first, Shared) and first.perfect):
+    # The cheapest set that sees a pattern may have more sensors than a budget allows.
+    if not (isinstance(first, Shared) and first.perfect and first.budget is None):
         return _of_sensors(plans)
     return _of_patterns(plans, first) if len(turns) == 1 else None
 
