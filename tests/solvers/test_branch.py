@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,6 +87,26 @@ def test_a_search_cut_short_keeps_a_bracket_around_the_optimum() -> None:
         solution = optimal.solve(world, on_progress=stop)
         assert solution.lower <= best + 1e-9
         assert solution.upper >= best - 1e-9
+
+
+@pytest.mark.parametrize(("step", "calls"), [("_push", 0), ("_open", 0), ("_open", 1)])
+def test_the_bound_holds_where_ctrl_c_comes_amid_an_expansion(
+    step: str, calls: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was being expanded is still open: its plans may be the best ones."""
+    tree, _, best = _tree()
+    whole, called = getattr(Tree, step), itertools.count()
+
+    def cut(*given: Any) -> None:
+        if next(called) == calls:
+            raise KeyboardInterrupt
+        whole(*given)
+
+    monkeypatch.setattr(Tree, step, cut)
+    with pytest.raises(KeyboardInterrupt):
+        _to_the_end(tree)
+    assert not tree.closed
+    assert (tree.upper() >= best - 1e-9).all()
 
 
 @pytest.mark.parametrize(

@@ -24,12 +24,14 @@ from trackmdp.motion.kernels import drift, random_walk
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, optimal
 from trackmdp.solvers.certify import delayed
+from trackmdp.solvers.certify.branch import Tree
 from trackmdp.solvers.certify.inner import InnerProblem
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found
 from trackmdp.solvers.solution import SearchProgress
 from trackmdp.solvers.solve import solve
+from trackmdp.world.make import make_world
 from trackmdp.world.model import World
 
 
@@ -146,6 +148,25 @@ def test_ctrl_c_keeps_the_bracket(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not solution.certified
     assert solution.lower == pytest.approx(seen[-1].lower)
     assert solution.upper == pytest.approx(seen[-1].upper)
+
+
+@pytest.mark.parametrize("calls", [1, 66])
+def test_ctrl_c_amid_an_expansion_proves_nothing_false(
+    calls: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = make_world("random_support", size=4, support_size=5, cost=0.3, t_max=2, seed=1)
+    best, push, pushed = optimal.solve(world), Tree._push, itertools.count()
+
+    def cut(tree: Tree, choices: Any) -> None:
+        if next(pushed) == calls:
+            raise KeyboardInterrupt
+        push(tree, choices)
+
+    monkeypatch.setattr(Tree, "_push", cut)
+    solution = optimal.solve(world)
+    assert solution.interrupted
+    assert not solution.certified
+    assert (solution.bound >= best.value - 1e-9).all()
 
 
 def test_the_same_world_gives_the_same_policy() -> None:

@@ -84,6 +84,8 @@ class Tree:
         self._heap: list[tuple[float, int, Choices]] = []
         # Sets left -> complete choices that wait until there are enough of them: arrays of a few rows are slow.
         self._complete: dict[int, list[Choices]] = {}
+        # Expanded at the moment: open until all that follow from them are, since Ctrl-C may come between.
+        self._in_hand: list[Choices] = []
         self._ticket = itertools.count()
         # Nothing is earned yet, all H sets are to be chosen, and no batch came before.
         start = sparse.eye_array(self._world.num_cells, format="csr") if mass is None else mass
@@ -97,9 +99,10 @@ class Tree:
     @property
     def closed(self) -> bool:
         """Whether no choice is open."""
-        return not self._heap and not self._complete
+        return not (self._heap or self._complete or self._in_hand)
 
     def _open_choices(self) -> Iterator[Choices]:
+        yield from self._in_hand
         for _, _, choices in self._heap:
             yield choices
         for batches in self._complete.values():
@@ -150,11 +153,14 @@ class Tree:
         """Expand open choices, best first, while there are any and `go_on(self)` holds."""
         while not self.closed and go_on(self):
             if self._heap:
+                self._in_hand = [self._heap[0][2]]
                 self._decide(heapq.heappop(self._heap)[2])
             for sets_left, batches in list(self._complete.items()):
                 if not self._heap or sum(len(each.state) for each in batches) >= ENOUGH:
+                    self._in_hand = batches
                     del self._complete[sets_left]
                     self._advance(batches)
+            self._in_hand = []
 
     def improvements(self) -> tuple[BoolArray, list[LeftOut]]:
         """`[B]` which problems have found a better plan, and the cells that it leaves unsensed at each step."""
