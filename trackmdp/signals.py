@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from types import FrameType
 from typing import Any, Self
@@ -22,16 +22,19 @@ _AGAIN = 20.0
 
 
 @contextmanager
-def handled(handler: Any, *numbers: signal.Signals) -> Iterator[Mapping[signal.Signals, Any]]:
+def handled(handler: Any, *numbers: signal.Signals) -> Iterator[None]:
     """Handle signals by `handler` inside; afterwards by the handlers from before, also if the body installs others.
 
-    Yields the handlers from before. Outside the main thread nothing is changed.
+    Outside the main thread nothing is changed.
     """
     # Python allows signal.signal in the main thread alone; `train` called from another one runs without.
     main = threading.current_thread() is threading.main_thread()
-    before = {number: signal.signal(number, handler) for number in numbers if main}
+    # All are known before the first is changed: from then on the handler may be called, and raise.
+    before = {number: signal.getsignal(number) for number in numbers if main}
     try:
-        yield before
+        for number in before:
+            signal.signal(number, handler)
+        yield
     finally:
         for number, former in before.items():
             if former is not None:  # a handler in C, which Python cannot put back
@@ -77,7 +80,8 @@ class Signals(ExitStack):
         self._first: dict[signal.Signals, float] = {}
 
     def __enter__(self) -> Self:
-        self._before = self.enter_context(handled(self._note, *HEARD))
+        self._before = {number: signal.getsignal(number) for number in HEARD}
+        self.enter_context(handled(self._note, *HEARD))
         return self
 
     def heard(self) -> bool:

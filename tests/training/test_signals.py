@@ -1,13 +1,16 @@
 from __future__ import annotations
 
+import itertools
 import signal
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from trackmdp.app.cli import main
-from trackmdp.signals import Signals, handled
+from trackmdp.errors import Preempted
+from trackmdp.signals import Signals, handled, stop
 
 
 def test_the_first_signal_is_noted_and_a_later_one_acts_as_before(
@@ -37,6 +40,36 @@ def test_the_first_signal_is_noted_and_a_later_one_acts_as_before(
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def at_installing(monkeypatch: pytest.MonkeyPatch, number: signal.Signals) -> None:
+    """The signal comes as soon as its handler is changed for the first time."""
+    put, changes = signal.signal, itertools.count()
+
+    def putting(changed: signal.Signals, handler: Any) -> Any:
+        former = put(changed, handler)
+        if changed is number and next(changes) == 0:
+            signal.raise_signal(number)
+        return former
+
+    monkeypatch.setattr(signal, "signal", putting)
+
+
+def test_a_signal_while_handlers_are_installed_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
+    with handled(lambda *_: None, signal.SIGINT):
+        at_installing(monkeypatch, signal.SIGINT)
+        with Signals() as signals:
+            assert signals.received == signal.SIGINT
+
+
+def test_a_signal_while_handlers_are_installed_leaves_none_of_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    at_installing(monkeypatch, signal.SIGTERM)
+    with pytest.raises(Preempted), handled(stop, signal.SIGTERM, signal.SIGUSR1):
+        pass
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_outside_the_main_thread_signals_are_not_touched() -> None:
