@@ -211,6 +211,18 @@ def test_a_signal_between_two_blocks_ends_the_run(
     assert signal.getsignal(number) == before
 
 
+def test_a_signal_in_the_last_iteration_of_a_block_begins_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ends(self: Checkpoints, trainer: Any) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(Checkpoints, "on_end", ends)
+    with pytest.raises(Preempted, match="stopped by signal 15"):
+        learned(tmp_path)
+    assert [each.name for each in (tmp_path / "blocks").iterdir()] == ["00000"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("cluster", [None, "local"])
 def test_the_result_does_not_depend_on_the_workers(

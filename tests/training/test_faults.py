@@ -129,18 +129,40 @@ def test_a_loss_that_is_not_finite_names_the_iteration_and_leaves_the_last_good_
     assert_same_run(tmp_path, whole[algo])
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1])
+@pytest.mark.parametrize(
+    ("number", "iteration"),
+    [(signal.SIGTERM, 3), (signal.SIGINT, 3), (signal.SIGUSR1, 3), (signal.SIGTERM, 8)],
+)
 def test_a_signal_ends_the_run_after_its_iteration_is_saved(
-    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, Path]
+    number: signal.Signals,
+    iteration: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    whole: dict[str, Path],
 ) -> None:
+    """The last one too: the optimum, which may take minutes, or a further block would come next."""
     before = signal.getsignal(number)
     with monkeypatch.context() as patch:
-        at_iteration(patch, 3, lambda: signal.raise_signal(number))
+        at_iteration(patch, iteration, lambda: signal.raise_signal(number))
         with pytest.raises(Preempted) as told:
             train(tmp_path, "checkpoint.every=0")
-    assert (told.value.signal, saved(tmp_path), signal.getsignal(number)) == (number, [3], before)
+    assert (told.value.signal, saved(tmp_path)) == (number, [iteration])
+    assert signal.getsignal(number) == before
     train(tmp_path, "checkpoint.every=0", "resume=auto")
     assert_same_run(tmp_path, whole["ppo"])
+
+
+class SignalsAtTheEnd(Callback):
+    """As where a log is sent elsewhere, which takes long."""
+
+    def on_end(self, trainer: Training) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_a_signal_while_logs_are_closed_is_heard() -> None:
+    world = tm.make_world("random_walk", size=3, cost=0.1)
+    with pytest.raises(Preempted, match="signal 15"):
+        tm.train(world, callbacks=[SignalsAtTheEnd()], total_frames=2000, frames_per_batch=1000)
 
 
 def test_rows_written_after_the_checkpoint_are_cut_off(

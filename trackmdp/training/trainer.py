@@ -112,6 +112,7 @@ class Trainer(Training):
                 # on_end is called after this, and reads it: only Preempted leaves a state that is worth saving.
                 self.error = error
                 raise
+        self._check_signals()  # one may have come while the callbacks ended
         self.position = replace(
             self.position, seconds=time.monotonic() - began + self.start.seconds
         )
@@ -182,8 +183,11 @@ class Trainer(Training):
                 iteration, before.frames + frames, elapsed, before.reward + earned
             )
             self._account(diagnostics, earned / frames if frames else None)
-            if self._signals.received and iteration < self.iterations:
-                raise Preempted(self._signals.received)
+            self._check_signals()
+
+    def _check_signals(self) -> None:
+        if self._signals.received:
+            raise Preempted(self._signals.received)
 
     def _collect(self, iteration: int) -> TensorDictBase | None:
         """The next batch, None once all frames are in."""
