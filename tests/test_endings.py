@@ -17,7 +17,7 @@ from trackmdp.app import launch
 from trackmdp.app.cli import main
 from trackmdp.durable import write_json
 from trackmdp.errors import Preempted, RunError, UserError
-from trackmdp.signals import leave
+from trackmdp.signals import leave, stop
 from trackmdp.solvers import optimal
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
@@ -112,6 +112,22 @@ def test_a_signal_behind_another_error_is_one_line_and_its_status(
     monkeypatch.setattr(launch, "launch", stopped)
     assert main(["solve"]) == 143
     assert capsys.readouterr() == ("", "trackmdp solve: interrupted\n")
+
+
+def test_a_signal_that_interrupts_as_ctrl_c_does_has_its_own_status(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As where Ray waits for workers."""
+
+    def stopped(*_: object) -> None:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            stop(signal.SIGTERM, None)
+
+    monkeypatch.setattr(launch, "launch", stopped)
+    assert main(["solve"]) == 143
+    assert capsys.readouterr() == ("", "trackmdp solve: stopped by signal 15\n")
 
 
 def test_errors_that_are_behind_each_other_are_one_line(

@@ -103,10 +103,10 @@ def _dispatch(words: list[str]) -> int:
 def _report(command: str, error: BaseException) -> int:
     """Print why a command ended, in one line unless it is a bug; returns the exit status."""
     line, status = str(error), FAILED
-    if signalled := _signalled(error):
-        line, status = "interrupted", signalled
-    elif isinstance(error, Preempted):
+    if isinstance(error, Preempted):
         status = 128 + error.signal
+    elif signalled := _signalled(error):
+        line, status = "interrupted", signalled
     elif isinstance(error, (UserError, RunError)):
         status = USER_MISTAKE if isinstance(error, UserError) else FAILED
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
