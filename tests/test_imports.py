@@ -76,6 +76,30 @@ def test_ctrl_c_while_the_command_line_is_imported_shows_no_traceback() -> None:
     assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
 
 
+BESIDE_THE_COMMAND = """
+import atexit, runpy, signal, sys
+from trackmdp.app import cli
+def interrupt(): signal.raise_signal(signal.SIGINT)
+{}
+sys.argv[1:] = ["--version"]
+runpy.run_module("trackmdp", run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize(
+    ("moment", "status"),
+    [("cli.leave_current_folder = interrupt", 130), ("atexit.register(interrupt)", -signal.SIGINT)],
+)
+def test_ctrl_c_before_and_after_the_command_shows_no_traceback(moment: str, status: int) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", BESIDE_THE_COMMAND.format(moment)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (status, "")
+
+
 def test_commands_leave_it_on() -> None:
     assert main(["train", "grid.size=0"]) == 2
     assert gc.isenabled() and gc.get_freeze_count() > 0
