@@ -15,6 +15,7 @@ import pytest
 from scipy import sparse
 
 import trackmdp as tm
+from tests.typed import typed
 from trackmdp.app.cli import main
 from trackmdp.config.compose import compose
 from trackmdp.errors import Preempted, UserError
@@ -291,7 +292,7 @@ def test_a_signal_ends_all_workers_and_none_begins_another_job(
 @pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGUSR1, signal.SIGTERM])
 def test_what_comes_while_workers_start_is_heard_afterwards(kind: signal.Signals) -> None:
     reached = []
-    with handled(stop, kind), pytest.raises(Preempted) as told, workers._starting():
+    with handled(stop, kind), pytest.raises(Preempted) as told, workers.starting():
         signal.raise_signal(kind)
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, [])
         reached.append(blocked)
@@ -302,8 +303,26 @@ def test_what_comes_while_workers_start_is_heard_afterwards(kind: signal.Signals
     assert not signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
+def test_pythons_tracker_of_semaphores_does_not_die_of_the_groups_signals() -> None:
+    """Its start, the first of all, unblocks Ctrl-C: the workers after it must not inherit that."""
+    code = """
+import signal
+from multiprocessing.resource_tracker import _resource_tracker as tracker
+from pathlib import Path
+from trackmdp.solvers.workers import starting
+with starting():
+    tracker.ensure_running()
+    print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))
+status = dict(line.split(":") for line in Path(f"/proc/{tracker._pid}/status").read_text().splitlines())
+print(bool(int(status["SigBlk"], 16) >> (signal.SIGUSR1 - 1) & 1))
+"""
+    done = typed(start=("-c", code))
+    assert done.stdout.split() == ["True", "True"]
+
+
 def test_a_signal_is_heard_also_where_a_worker_dies_of_it_first() -> None:
-    with handled(stop, signal.SIGTERM), pytest.raises(Preempted), workers._starting():
+    with handled(stop, signal.SIGTERM), pytest.raises(Preempted), workers.starting():
         signal.raise_signal(signal.SIGTERM)
         raise BrokenProcessPool
 

@@ -285,6 +285,27 @@ def test_a_worker_that_does_not_start_is_one_line(
     assert len(line.splitlines()) == 1
 
 
+def told(*given: Any) -> Any:
+    """An environment whose worker, while it starts, gets what a terminal or a scheduler sends to the whole group."""
+    for number in (signal.SIGINT, signal.SIGUSR1):
+        signal.raise_signal(number)
+    os.kill(os.getppid(), signal.SIGUSR1)
+    return collect.own_env(*given)
+
+
+@pytest.mark.slow
+def test_a_signal_while_workers_start_is_heard_once_they_have(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(collect, "_worker_env", told)
+    with signals.handled(signals.stop, signal.SIGUSR1), pytest.raises(Preempted):
+        train(tmp_path, "collector=multi_sync")
+    assert "Traceback" not in capfd.readouterr().err
+    for worker in multiprocessing.active_children():
+        worker.join(60)
+    assert not multiprocessing.active_children()
+
+
 def test_a_worker_ends_with_the_learner_that_was_killed() -> None:
     code = """
 import multiprocessing, threading

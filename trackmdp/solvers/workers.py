@@ -11,6 +11,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from types import FrameType
 from typing import Any, Protocol, TypeVar
 
@@ -90,7 +91,7 @@ def _processes(workers: int) -> Iterator[Crew]:
             # a worker died: all unfinished jobs are run again
             with suppress(BrokenProcessPool):
                 for number in left:
-                    with _starting():
+                    with starting():
                         futures[number] = pool.submit(_done, work, jobs[number])
             for number, future in futures.items():
                 with suppress(BrokenProcessPool):
@@ -113,28 +114,32 @@ def _processes(workers: int) -> Iterator[Crew]:
         pool.shutdown(cancel_futures=True)  # no further job begins
 
 
+_LATER = {signal.SIGINT, signal.SIGUSR1}
+"""Signals that are blocked while workers start."""
 _ended: list[Preempted] = []
 """In a worker: the signal that ended its last job."""
 
 
 def _pool(workers: int) -> ProcessPoolExecutor:
-    with _starting():
+    with starting():
         # Spawned, not forked: a fork copies locks that another thread of this process may hold.
         return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), end_with_parent)
 
 
 @contextmanager
-def _starting() -> Iterator[None]:
-    """Block SIGINT and SIGUSR1 while workers start; they inherit the mask.
+def starting() -> Iterator[None]:
+    """Block SIGINT and SIGUSR1 while workers start; they, and Python's tracker of semaphores, inherit the mask.
 
     This process notes the signals, ends the workers with SIGTERM, and raises the signals again at the end.
     """
     heard: list[int] = []
     # A process that gets a signal while it still imports would write a traceback, so would a worker left half started.
     # The handler notes the signal all the same, since another thread may receive it.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGUSR1})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _LATER)
     try:
         with handled(lambda number, _: heard.append(number), *HEARD), safe_children():
+            resource_tracker.ensure_running()
+            signal.pthread_sigmask(signal.SIG_BLOCK, _LATER)  # its start has unblocked SIGINT
             yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)

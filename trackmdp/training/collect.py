@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -16,9 +17,8 @@ from trackmdp.config.learning import CollectorConfig, WorkersConfig
 from trackmdp.config.registry import maker
 from trackmdp.environment.env import TrackEnv
 from trackmdp.errors import RunError, message_of
-from trackmdp.imports import safe_children
 from trackmdp.seeding import seed_global
-from trackmdp.solvers.workers import end_with_parent
+from trackmdp.solvers.workers import end_with_parent, starting
 from trackmdp.training.devices import make_device
 from trackmdp.world.group import Subject
 
@@ -100,11 +100,15 @@ def _in_workers(
         RunError: a worker ended before it could collect.
     """
     threads = {"num_threads": torch.get_num_threads(), "num_sub_threads": cfg.threads}
-    with safe_children():
-        try:
-            return kind(of_workers(_worker_env, env, cfg, done), policy, **threads, **common)
-        except (RuntimeError, EOFError, OSError) as error:
-            raise not_started(cfg, error) from error
+    with ExitStack() as begun:
+        with starting():
+            try:
+                made = kind(of_workers(_worker_env, env, cfg, done), policy, **threads, **common)
+            except (RuntimeError, EOFError, OSError) as error:
+                raise not_started(cfg, error) from error
+            begun.callback(made.shutdown)
+        begun.pop_all()  # no signal came meanwhile
+        return made
 
 
 def not_started(cfg: WorkersConfig, error: Exception) -> RunError:
