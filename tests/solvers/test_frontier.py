@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import sys
 from dataclasses import replace
 from functools import cache
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,7 @@ from tests.solvers.worlds import all_plans
 from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.frontier import FrontierProgress, frontier
+from trackmdp.solvers.frontier import FrontierProgress, _Trace, frontier
 from trackmdp.solvers.tradeoff import Tradeoff
 from trackmdp.world.model import World
 
@@ -248,6 +250,30 @@ def test_ctrl_c_leaves_the_corners_found_so_far() -> None:
     assert seen[-1].corners == len(made.corners)
     assert made.gap >= seen[-1].left > made.resolution
     assert made.at(sensors=0.5).sensors == pytest.approx(0.5)
+
+
+def test_ctrl_c_at_any_line_keeps_each_price_with_its_bound() -> None:
+    """In the third solve, line by line."""
+    code, passed = _Trace.solve.__code__, itertools.count()
+
+    def traced(frame: FrameType, event: str, _: object) -> Any:
+        if event == "call":
+            return traced if frame.f_code is code and next(calls) == 2 else None
+        if event == "line" and next(lines) == line:
+            raise KeyboardInterrupt
+        return traced
+
+    for line in passed:
+        calls, lines, before = itertools.count(), itertools.count(), sys.gettrace()
+        sys.settrace(traced)
+        try:
+            made = frontier(small(None))
+        finally:
+            sys.settrace(before)
+        if not made.interrupted:
+            break
+        assert len(made.slopes) == len(made.bounds) >= 2
+    assert line > 10
 
 
 @pytest.mark.parametrize(

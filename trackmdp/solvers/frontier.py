@@ -166,9 +166,11 @@ class _Trace:
             sensors=self.spent(found.table, figures.sensors_per_step),
             net=figures.accuracy - safe,
         )
-        self.slopes.append(price / world.reward)
-        self.bounds.append(corner.upper / (world.reward * self.steps))
-        self.hull = upper_hull([*self.hull, corner])
+        slopes = [*self.slopes, price / world.reward]
+        bounds = [*self.bounds, corner.upper / (world.reward * self.steps)]
+        hull = upper_hull([*self.hull, corner])
+        # All or none of them: nothing is called here, after which Python would hear Ctrl-C.
+        self.slopes, self.bounds, self.hull = slopes, bounds, hull
         # Only with the corner kept: an interrupted search has a policy and a bound as well.
         if found.interrupted:
             raise KeyboardInterrupt
