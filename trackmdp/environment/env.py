@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from trackmdp.environment.action_spec import at_most
 from trackmdp.environment.dynamics import FLAGS, State
 from trackmdp.environment.render import picture
 from trackmdp.environment.tracking import Snapshot, Tracking
@@ -56,10 +57,11 @@ class TrackEnv(EnvBase):
     and ``rollout(..., break_when_any_done=False)``, which unrolls its steps: keep it to a few. On a CPU it does not
     pay: sums and masks of bits as compiled by torch 2.13 are several times slower than the plain step.
 
-    An `action` `[*B, K]` of 0 and 1, of any dtype, is a set of sensors. Without `window` in the world these are all
-    sensors: K = M and sensor k covers cell k, or K = S with footprints. With a window K = (2W + 1)² and actions,
-    those remembered included, are in the local numbers of `Window`, as seen from `last_cell`: a sensor farther away
-    cannot be chosen, and one outside the grid costs and senses nothing.
+    An `action` `[*B, K]` of 0 and 1, of any dtype, is a set of sensors; those that `action_spec` draws keep to the
+    budget. Without `window` in the world these are all sensors: K = M and sensor k covers cell k, or K = S with
+    footprints. With a window K = (2W + 1)² and actions, those remembered included, are in the local numbers of
+    `Window`, as seen from `last_cell`: a sensor farther away cannot be chosen, and one outside the grid costs and
+    senses nothing.
 
     Of a `Group` K is the number of targets, and actions are `[*B, S]`. `last_cell` and `steps_since_detection` are
     `[*B, K]`; `present` `[*B, K]` bool shows which targets are in the grid; `action_history` `[*B, t_max+1, S]` holds
@@ -165,8 +167,8 @@ class TrackEnv(EnvBase):
     def _make_specs(self, task: Task) -> None:
         b = self.batch_size
 
-        def bits(*shape: int) -> Binary:
-            return Binary(shape=(*b, *shape), dtype=torch.bool, device=self.device)
+        def bits(*shape: int, kind: type[Binary] = Binary) -> Binary:
+            return kind(shape=torch.Size((*b, *shape)), dtype=torch.bool, device=self.device)
 
         # n takes t_max + 2 values: 0 ... t_max + 1, the last one with the safe action forced.
         values = {"last_cell": task.num_cells, "steps_since_detection": task.t_max + 2}
@@ -181,20 +183,14 @@ class TrackEnv(EnvBase):
             for name, each in state.items()
         }
         self.observation_spec = Composite(observed, shape=b)
-        self.action_spec = bits(self.num_sensors)
+        free = task.budget is None or task.budget >= self.num_sensors
+        kind = Binary if free else at_most(task.budget, self.num_sensors)
+        self.action_spec = bits(self.num_sensors, kind=kind)
         self.reward_spec = Unbounded((*b, 1), device=self.device)
         self.done_spec = Composite({name: bits(1) for name in FLAGS}, shape=b)
         self._observed = tuple(observed)
         self._shown = (*observed, "reward", *FLAGS)
         self._carried = (*observed, *FLAGS)
-
-    def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        """A random set of sensors, of those that the budget allows; see `EnvBase`."""
-        drawn = super().rand_action(tensordict)
-        if self._budget is not None:
-            kept = torch.rand(self._action_shape, device=self.device).argsort(-1) < self._budget
-            drawn["action"] = drawn["action"] & kept
-        return drawn
 
     def _set_seed(self, seed: int | None) -> None:
         self._seed = seed or 0
