@@ -135,6 +135,25 @@ def test_rare_keys_keep_their_plans() -> None:
     assert not fewer[~changed].any()
 
 
+def test_a_plan_whose_best_reward_is_negative_is_searched_until_none_is_better(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """At prices above the reward; a table of the same reward is no better."""
+    tracks, rounds = line_walks(1, count=60), []
+    task = replace(recorded(tracks), cost=np.full(9, 1.1), safe_cost=np.float64(3.0))
+    monkeypatch.setattr(path_plans, "_LEAST", 5)
+    found = path_plans._searched(planned(task, tracks, prior=1.0, rounds=3))
+    assert found.reward < 0
+
+    def counted(*args: Any) -> Any:
+        rounds.append(args)
+        return exchanged_keys(*args)
+
+    monkeypatch.setattr(path_plans, "exchanged_keys", counted)
+    assert path_plans._searched(found).reward == found.reward
+    assert len(rounds) == 1
+
+
 def test_no_recording_learns_and_judges() -> None:
     tracks = line_walks(2, count=40)
     named = replace(tracks, names=np.arange(40) // 2)

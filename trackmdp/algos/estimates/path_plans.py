@@ -171,7 +171,7 @@ def _searched(plan: Planned) -> Planned:
             break
         table = found(share)
         tried = paths.follow(table)
-        if tried.reward > plan.reward * (1.0 + _RISE):
+        if tried.reward > plan.reward + _RISE * abs(plan.reward):
             plan = replace(plan, plans=replace(plan.plans, table=table), reward=tried.reward)
             followed, found = tried, None
         elif share > _LEAST_SHARE:
