@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import pytest
 import torch
@@ -15,7 +16,8 @@ from trackmdp.policies.actor_critic import SubsetDistribution
 
 ON_POLICY = ["a2c", "ppo"]
 GAMMA, LAMBDA, SCALE, CONSTANT = 0.8, 0.5, 0.1, 3.0
-SETTINGS = (f"algo.gamma={GAMMA}", f"algo.gae_lambda={LAMBDA}", f"algo.reward_scale={SCALE}")
+# The hops earn 2, the unit of rewards.
+SETTINGS = (f"algo.gamma={GAMMA}", f"algo.gae_lambda={LAMBDA}", f"algo.reward_scale={2 * SCALE}")
 
 
 def frames(terminated: list[int], truncated: list[int], misses: list[int]) -> TensorDict:
@@ -120,7 +122,7 @@ def test_schedules_follow_the_progress_of_the_run(name: str) -> None:
 @pytest.mark.parametrize("name", ON_POLICY)
 def test_the_expected_price_takes_the_place_of_the_price_paid(name: str) -> None:
     """Four sensors for .5 each are on, with probability 1/2: 1 less is expected; not where forced, nor at an exit."""
-    learner = algorithm(name, tm.World(hop_world().kernel, 2, cost=0.5, t_max=1), *SETTINGS)
+    learner = algorithm(name, replace(hop_world(), cost=0.5), *SETTINGS)
     batch = frames([0, 0, 0, 1], [0] * 4, misses=[0, 1, 2, 0])
     batch["logits"] = torch.zeros(1, 4, 4)
     data, _ = learner.prepare(batch)

@@ -188,13 +188,14 @@ class DQN(Checkpointed):
         targets: Sequence[int] = (),
     ) -> None:
         self.cfg, self.iterations, self.iteration, self.device = cfg, iterations, 0, device
-        qvalue = make_qvalue(task, cfg.hidden, cfg.reward_scale, targets).to(device)
+        self._scale = cfg.reward_scale / task.reward
+        qvalue = make_qvalue(task, cfg.hidden, self._scale, targets).to(device)
         self.budget = task.budget
         self.explore = EpsilonFlip(cfg.epsilon.start, qvalue.module.units, task.budget).to(device)
         self.policy = TensorDictSequential(qvalue, self.explore)
         self.loss = AdditiveDQNLoss(qvalue, task.budget)
         self.target = SoftUpdate(self.loss, tau=cfg.target_tau)
-        self.slow = make_qvalue(task, cfg.hidden, cfg.reward_scale, targets).to(device)
+        self.slow = make_qvalue(task, cfg.hidden, self._scale, targets).to(device)
         self.parameters = list(qvalue.parameters())
         self.optimizer = torch.optim.Adam(self.parameters, lr=cfg.learning_rate.start, fused=True)
         per = cfg.prioritized
@@ -230,7 +231,7 @@ class DQN(Checkpointed):
         rate = self.cfg.learning_rate.at(progress)
         set_learning_rate(self.optimizer, rate)
         if batch is not None:
-            batch["next", "reward"] = batch["next", "reward"] * self.cfg.reward_scale
+            batch["next", "reward"] = batch["next", "reward"] * self._scale
             self.buffer.extend(n_step(batch, self.cfg.n_step, self.cfg.gamma, self.policy.in_keys))
         averages = Averages()
         for _ in range(self.cfg.updates):

@@ -79,7 +79,7 @@ class _Paths:
         """The plans of all keys, V `[keys]` given."""
         *detected, missed = (self._task.reward + value[end] for _, end in self._steps)
         missed = self._last @ (missed - self._task.safe_cost)
-        return Plans(self._turns, np.ones(self._count), detected, missed)
+        return Plans(self._turns, np.ones(self._count), detected, missed, self._task.reward)
 
     def sets(self, policy: PolicyTable) -> list[BoolArray]:
         """Its decisions here, `[G, 1]` for each free choice."""

@@ -66,6 +66,7 @@ class OnPolicy(Checkpointed):
     ) -> None:
         self.cfg, self._t_max, self._targets = cfg, task.t_max, targets
         self.iterations, self.iteration, self.device = iterations, 0, device
+        self._scale = cfg.reward_scale / task.reward
         own = actor or make_actor(task, cfg.hidden, cfg.initial_logit, targets)
         self.policy = own.to(device)
         self.critic = (critic or make_critic(task, cfg.hidden, targets)).to(device)
@@ -144,14 +145,14 @@ class OnPolicy(Checkpointed):
             more = batch["action"].float() - expected
             reward = reward + price(self.costs, batch, more) * paid
         # Before the advantage, so that the critic's targets are scaled as well; evaluation never sees scaled rewards.
-        batch["next", "reward"] = reward * self.cfg.reward_scale
+        batch["next", "reward"] = reward * self._scale
         with torch.no_grad():
             self.advantage(batch)
         fit = explained_variance(batch["state_value"], batch["value_target"]).item()
         seen = {*self.critic.in_keys, *self.policy.in_keys}
         data = batch.select(*sorted(seen), *_KEPT, strict=False).reshape(-1)
         data["advantage"], unit = _normalised(data["advantage"], clock.reshape(-1, 1), self._t_max)
-        data["price_weight"] = unit * paid.reshape(-1, 1) * self.cfg.reward_scale
+        data["price_weight"] = unit * paid.reshape(-1, 1) * self._scale
         return data, {"learning_rate": rate, "entropy_coef": entropy, "explained_variance": fit}
 
 

@@ -95,7 +95,7 @@ class NetworkConfig(EveryTaskConfig):
     learning_rate: ScheduleConfig = nested(LEARNING_RATE)
     max_grad_norm: float = option("gradients are clipped to this norm", gt=0)
     hidden: int = count_option("units of the hidden layer of each network", unit="units", le=4096)
-    reward_scale: float = option("factor on rewards while learning", gt=0)
+    reward_scale: float = option("factor on rewards while learning, in units of cost.reward", gt=0)
 
     def needs(self, task: Any, root: Any) -> dict[str, int]:
         """Two networks and their optimiser; their hidden units for each target of a batch."""

@@ -120,7 +120,7 @@ def best_of(
         # Where these are the plans at hand, exchange has been tried.
         tried = exchange(plans, after, rows_changed(plans.turns, policy.sets, after), go_on)
         worth, other_worth = (plans.worth_of(each) for each in (policy.sets, tried))
-        better = other_worth > worth + 1e-10 * (1.0 + np.abs(worth))
+        better = other_worth > worth + plans.rounding(worth)
         sets = mixed(plans.turns, better, tried, policy.sets)
         policy = risen(policy, plans, sets) or policy
         if not go_on():
@@ -183,7 +183,7 @@ def could_gain(plans: Plans, policy: Found) -> BoolArray:
 def hopeful(plans: Plans, sets: Sequence[BoolArray], most: Array) -> BoolArray:
     """`[K]`, whether plans `sets` are worth less than `most` `[K]`."""
     worth = plans.worth_of(sets)
-    return most - worth > 1e-9 * (1.0 + np.abs(worth))
+    return most - worth > 10 * plans.rounding(worth)
 
 
 def revealed(world: World, detected: Array, missed: Array, length: int) -> Array:
@@ -245,7 +245,7 @@ def _cut(plans: Plans, rows: IndexArray) -> tuple[Plans, list[IndexArray]]:
         turns.append(Turn(*owners, moves, turn.stay[before], choice, turn.price[mine]))
         decisions.append(mine)
         detected.append(worth[now, 0])
-    return Plans(turns, plans.mass[start, 0], detected, plans.missed[now, 0]), decisions
+    return Plans(turns, plans.mass[start, 0], detected, plans.missed[now, 0], plans.unit), decisions
 
 
 def _exchanged(plans: Plans, sets: Sequence[BoolArray]) -> list[BoolArray]:
@@ -270,7 +270,7 @@ def _better(
     reached = plans.worth(candidates)
     best = reached.argmax(axis=1)[:, None]
     most = np.take_along_axis(reached, best, axis=1)
-    gains = most > worth + 1e-10 * (1.0 + np.abs(worth))
+    gains = most > worth + plans.rounding(worth)
     chosen = []
     for turn, on, old in zip(plans.turns, candidates, plan, strict=True):
         rows, wide = turn.choice.rows, np.broadcast_to(on, (len(on), reached.shape[1]))

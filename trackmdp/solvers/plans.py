@@ -90,6 +90,7 @@ class Plans:
         mass: `[E_0]`, weight of each entry at the start.
         detected: `[E]` for each turn, worth of locating the target there, r + V.
         missed: `[E]`, worth of the target's being missed at the last turn.
+        unit: r, by which rounding is measured where a plan is worth less.
         credit: `[E]` for each turn, optimistic gain of locating the target there over missing it; None: none is known.
 
     Attributes:
@@ -97,6 +98,7 @@ class Plans:
         length: H, free choices.
         turns: as given.
         mass, missed: `[E, 1]` as given.
+        unit: as given.
         detected: `[E, 1]` for each turn.
     """
 
@@ -106,9 +108,11 @@ class Plans:
         mass: Array,
         detected: Sequence[Array],
         missed: Array,
+        unit: float,
         credit: Sequence[Array] | None = None,
     ) -> None:
         self.turns, self.length, self.count = turns, len(turns), turns[0].choice.count
+        self.unit = unit
         self.mass, self.missed, self._credit = mass[:, None], missed[:, None], credit
         self.detected = [each[:, None] for each in detected]
 
@@ -138,6 +142,10 @@ class Plans:
     def worth_of(self, sets: Sequence[BoolArray]) -> Array:
         """`[K]`, the same of one candidate."""
         return self.worth(sets)[:, 0]
+
+    def rounding(self, worth: Array) -> Array:
+        """By how much more than `worth` a plan has to be worth to count as better."""
+        return 1e-10 * (self.unit + np.abs(worth))
 
     def missing(self, t: int, on: AnyArray, mass: Array) -> Array:
         """`[E, C]`, the part of `mass` at step t that the set `on` leaves undetected."""

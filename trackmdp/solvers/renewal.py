@@ -168,7 +168,7 @@ class Renewal:
         if credit is not None:
             credit = [each[step.states] for each, step in zip(credit, free, strict=True)]
         mass = np.ones(self.normal) if weight is None else weight[: self.normal]
-        return Plans(self.turns, mass, detected, self.missed(value), credit)
+        return Plans(self.turns, mass, detected, self.missed(value), task.reward, credit)
 
     @cached_property
     def turns(self) -> list[Turn]:

@@ -241,4 +241,4 @@ def _trees(paths: Paths, followed: AlongPaths, keys: IndexArray) -> Plans:
         ways.choose(*ways.moved(step.rows[some], cells[step.states[some]], task.num_cells))
         detected.append(mean(step.rows[some], task.reward + followed.value[step.following[some]]))
     missed = mean(step.rows, renewal.missed(followed.value))
-    return Plans(ways.turns, start, detected, missed)
+    return Plans(ways.turns, start, detected, missed, task.reward)

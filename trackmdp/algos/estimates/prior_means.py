@@ -56,7 +56,7 @@ class PriorMeans:
         gains, weight = np.maximum((together @ own).toarray(), 0.0), together @ arrived
         # Poisson counts with a gamma prior on the lift (DuMouchel 1999): a rare displacement that was seen once is no
         # lift of a hundred, as it would be were chances smoothed before they are divided.
-        prior = max(prior**2 / (_LIFTED * paths.copies), _LITTLE)
+        prior = task.reward * max(prior**2 / (_LIFTED * paths.copies), _LITTLE)
         chance = weight[:, None] * (gains.sum(0) / max(weight.sum(), 1e-12))
         lift = (gains + prior) / (chance + prior)
         common = np.maximum(common, 0.0)

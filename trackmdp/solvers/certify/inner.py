@@ -80,4 +80,5 @@ class InnerProblem:
         if credit is not None:
             credit = [each[step.states] for each, step in zip(credit, steps, strict=True)]
         weight = np.ones(self.world.num_cells) if mass is None else mass
-        return Plans(self.turns, weight, detected, self.missed[steps[-1].states], credit)
+        missed = self.missed[steps[-1].states]
+        return Plans(self.turns, weight, detected, missed, self.world.reward, credit)
