@@ -64,6 +64,31 @@ def test_an_option_that_differs_is_named_once() -> None:
     assert found.methods == ["model_based, gamma=0.7", "model_based, gamma=0.9"]
 
 
+def test_a_seed_counts_once_options_that_change_no_policy_tell_its_runs_apart() -> None:
+    runs = [
+        run(f"{s}{e}{t}", options={"seed": s, "evaluation.every": e, "threads": t})
+        for s, e, t in ((0, 1, 1), (0, 2, 1), (1, 1, 1), (1, 2, 1), (2, 1, 4))
+    ]
+    found = study(runs)  # threads tell no runs of one seed apart
+    assert found.methods == ["model_based, evaluation.every=1", "model_based, evaluation.every=2"]
+    assert [[r.seed for r in group] for group in found.groups.values()] == [[0, 1, 2], [0, 1]]
+
+
+def test_runs_that_start_from_the_weights_of_others_are_a_method_of_their_own() -> None:
+    fresh, from_own, from_one = (None, None), ("/s0", "/s1"), ("/s0", "/s0")
+    for sources in (from_own, from_one):
+        runs = [
+            run(f"{s}{start[s]}", "algo=a2c", options={"seed": s, "init_from": start[s]})
+            for start in (fresh, sources)
+            for s in (0, 1)
+        ]
+        found = study(runs)
+        assert found.methods == ["a2c, init_from=a run", "a2c"]
+        assert [[r.seed for r in group] for group in found.groups.values()] == [[0, 1], [0, 1]]
+    twice = [run(start, "algo=a2c", options={"init_from": start}) for start in ("/s0", "/s1")]
+    assert study(twice).methods == ["a2c, init_from=/s0", "a2c, init_from=/s1"]
+
+
 def test_options_that_go_together_are_named_by_one_of_them() -> None:
     runs = [run(str(frames), f"algo.total_frames={frames}") for frames in (20_000, 40_000)]
     assert study(runs).methods == [

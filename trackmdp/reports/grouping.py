@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import chain, product
 from typing import Any
 
 from trackmdp.reports.results import FinishedRun
@@ -24,11 +24,9 @@ SHORT = {
 OPEN = 5e-5
 """Regret per step that no figure of four digits shows: a narrower bracket is an optimum."""
 _WORLD = ("grid.", "kernel.", "cost.", "sensor.", "targets.count")
-_KNOWLEDGE = "kernel.homogeneous"
-"""An option of the kernel that only the learner reads."""
 # Options of no effect on the learned policy, or of its draw.
 _IGNORED = (
-    *("seed", "quiet", "device", "threads", "resume", "init_from"),
+    *("seed", "quiet", "device", "threads", "resume"),
     *("log.", "checkpoint.", "evaluation.", "optimal."),
 )
 
@@ -117,7 +115,8 @@ def _known(values: Iterable[float | None]) -> list[float]:
 
 def study(runs: Sequence[FinishedRun]) -> Study:
     """Group runs; a label names the options that differ between them."""
-    parts = {run.name: _parted(run.settings) for run in runs}
+    telling = _telling(runs)
+    parts = {run.name: _parted(run.settings, telling) for run in runs}
     of_world, of_method = ({name: each[k] for name, each in parts.items()} for k in (0, 1))
     worlds = _labels(of_world, "kernel.name", named=("kernel.support_size", "cost.sensor"))
     methods = _labels(of_method, "algo.name")
@@ -131,15 +130,31 @@ def study(runs: Sequence[FinishedRun]) -> Study:
     return Study([*dict.fromkeys(worlds.values())], [*dict.fromkeys(methods.values())], filled)
 
 
-def _parted(settings: Options) -> tuple[Options, Options]:
-    """Options of the world and of the method, those that set neither left out."""
+def _telling(runs: Sequence[FinishedRun]) -> set[str]:
+    """Options that no method is named by, but in which runs of one seed differ: else that seed would count twice."""
+    alike: dict[str, list[Options]] = {}
+    for run in runs:
+        key = json.dumps([*_parted(run.settings), run.seed], sort_keys=True)
+        alike.setdefault(key, []).append(run.settings)
+    return {
+        key
+        for group in alike.values()
+        for key in {*chain(*group)} - {"quiet", "resume"}
+        if any(each.get(key) != group[0].get(key) for each in group)
+    }
+
+
+def _parted(settings: Options, telling: Collection[str] = ()) -> tuple[Options, Options]:
+    """Options of the world and of the method, those that set neither, nor are `telling`, left out."""
     # The options with a short name first: of options that vary together the first one is named.
     world = {key: settings[key] for key in SHORT if key in settings}
     method = {}
     for key, value in settings.items():
-        if key.startswith(_WORLD) and key != _KNOWLEDGE:
+        if key.startswith(_WORLD):
             world[key] = value
-        elif not key.startswith(_IGNORED):
+        elif key == "init_from" and key not in telling:  # each seed may have a source of its own
+            method[key] = value and "a run"
+        elif key in telling or not key.startswith(_IGNORED):
             method[key] = value
     return world, method
 
