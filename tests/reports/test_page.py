@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -61,10 +62,20 @@ def test_the_paper_s_worlds_are_found_by_z_and_price(results: Results) -> None:
     assert list(pairs(study(results.runs))) == list(PAIRS)
 
 
-def test_a_price_for_each_cell_is_none_of_the_paper_s(results: Results) -> None:
-    runs = [
-        replace(run, settings={**run.settings, "cost.sensor": [0.22] * 100}) for run in results.runs
-    ]
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"cost.sensor": [0.22] * 100},  # a price for each cell
+        {"sensor.name": "miss", "sensor.p_d": 0.5},
+        {"cost.budget": 2},
+        {"cost.mean_budget": 2.0},
+        {"targets.count": 2},
+    ],
+)
+def test_worlds_with_what_the_paper_does_not_have_are_none_of_its(
+    results: Results, other: dict[str, Any]
+) -> None:
+    runs = [replace(run, settings={**run.settings, **other}) for run in results.runs]
     assert not pairs(study(runs))
 
 

@@ -48,6 +48,10 @@ _FIXED = {
     **{f"kernel.{name}": value for name, value in _MOTION.items()},
     "cost.reward": REWARD,
     "cost.safe": None,
+    "cost.budget": None,
+    "cost.mean_budget": None,
+    "sensor.name": "perfect",
+    "targets.count": 1,
 }
 """The paper's settings of its worlds."""
 
@@ -80,9 +84,10 @@ def pairs(study: Study) -> Pairs:
         settings = runs[0].settings
         pair: Any = settings.get("kernel.support_size"), settings.get("cost.sensor")
         # T_max, border and seed of the kernel are not compared: the paper does not give them.
-        other = any(settings.get(key) != value for key, value in _FIXED.items())
+        # An option that a stored run does not have was the paper's, as there was no other.
+        other = any(settings.get(key, value) != value for key, value in _FIXED.items())
         # A list, as prices may be a list, which has no hash.
-        if other or settings.get("targets.count", 1) != 1 or pair not in [*PRINTED_QMDP]:
+        if other or pair not in [*PRINTED_QMDP]:
             continue
         if pair not in found or len(study.of(found[pair])) < len(runs):
             found[pair] = world
