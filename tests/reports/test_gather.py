@@ -21,8 +21,10 @@ from trackmdp.errors import UserError
 from trackmdp.policies.saved import load_policy, save_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.reports import watch
+from trackmdp.reports.figures import panels
 from trackmdp.reports.finished import MOST_POINTS, averaged_sets
 from trackmdp.reports.gather import gather_runs
+from trackmdp.reports.grouping import study
 from trackmdp.reports.page import build
 from trackmdp.reports.results import Results, load_results, save_results
 from trackmdp.sensing.task import Task
@@ -261,6 +263,42 @@ def test_runs_of_other_versions_and_repeated_runs_are_listed(sweep: Path) -> Non
         "z": "the same config as a2c-0.22-0, which counts",
     }
     assert len(found.runs) == 12
+
+
+def test_runs_of_a_file_that_has_changed_are_of_another_world(tmp_path: Path) -> None:
+    file = tmp_path / "motion.npy"
+    words = ("grid.size=2", "kernel=table", f"kernel.path={file}")
+    for name, stay, algo, seed, cost in (
+        ("a0", 0.5, "a2c", 0, 0.1),
+        ("a1", 0.5, "a2c", 1, 0.1),
+        ("b0", 0.9, "a2c", 0, 0.1),
+        ("b1", 0.9, "ppo", 0, 0.1),
+        ("c0", 0.9, "a2c", 0, 0.2),
+        ("c1", 0.5, "a2c", 0, 0.2),
+    ):
+        np.save(file, stay * np.eye(4))
+        write_run(tmp_path / name, *words, f"algo={algo}", seed=seed, cost=cost)
+    found = gather_runs(tmp_path)
+    other = {run: text.split()[-1] for run, text in reasons(found).items()}
+    assert other == {"b0": "a0", "b1": "a0", "c1": "c0"}
+    grouped = study(found.runs)
+    names = {tuple(run.name for run in runs) for runs in grouped.groups.values()}
+    assert names == {("a0", "a1"), ("b0",), ("b1",), ("c0",), ("c1",)}
+    lines = [
+        [grouped.of(world, "a2c")[0].name for world in worlds.values()]
+        for _, worlds in panels(grouped)
+    ]
+    assert sorted(lines) == [["a0", "c1"], ["b0", "c0"]]
+
+
+def test_a_run_that_was_quiet_is_the_same_run(sweep: Path) -> None:
+    loud = sweep / "loud"
+    shutil.copytree(sweep / "a2c-0.22-0", loud)
+    text = (loud / "config.yaml").read_text()
+    (loud / "config.yaml").write_text(text.replace("quiet: true", "quiet: false"))
+    plain = read_summary(loud) | {"config_sha256": "another"}
+    write_summary(loud, {key: value for key, value in plain.items() if key != "files"})
+    assert reasons(gather_runs(sweep)) == {"loud": "the same config as a2c-0.22-0, which counts"}
 
 
 @pytest.mark.parametrize("content", [None, "runs/notes.txt"])

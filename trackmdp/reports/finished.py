@@ -18,7 +18,7 @@ from trackmdp.errors import UserError
 from trackmdp.policies.saved import load_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.reports.maps import MOST_MAP_CELLS
-from trackmdp.reports.results import FIGURES, HELD_OUT, FinishedRun, Mapped, checked
+from trackmdp.reports.results import CONTENT, FIGURES, HELD_OUT, FinishedRun, Mapped, checked
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.hidden import averaged, mode_shares
 from trackmdp.solvers.linear import DIRECT_CELLS
@@ -26,12 +26,20 @@ from trackmdp.solvers.value import key_visits, value_of
 from trackmdp.training.folders import METRICS, SUMMARY, check_files, read_summary
 from trackmdp.untrusted import LARGE, decoded, parse_yaml, read_text
 from trackmdp.world.model import World
-from trackmdp.world.problem_file import PROBLEM, read_problem
+from trackmdp.world.problem_file import PROBLEM, digest_of, read_problem
 
 MOST_POINTS = 16
 """Points kept of a learning curve, evenly spaced in the logarithm of the iteration."""
 
 _TRACKED = {name: name.removeprefix("held_out_") for name in HELD_OUT}
+_OF_FILES = {
+    "kernel.path": ("kernel", "tracks", "validation", "held_out"),
+    "cost.sensor": ("cost",),
+    "sensor.path": ("coverage",),
+    "sensor.p_d": ("detection",),
+    "sensor.p_s": ("safe_detection",),
+}
+"""Options that may name a file -> what is read from it, in `problem.npz`."""
 _BOUNDS = {"printed bound": "paper", "valid bound": "valid", "clocked bound": "clocked"}
 
 
@@ -47,6 +55,15 @@ def read_run(place: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]]:
     curve = read_curve(place, summary) if (place / METRICS).is_file() else []
     with decoded(str(place / SUMMARY), "the summary of a run"):
         settings, figures = flatten(config), _figures(summary)
+        read = [
+            each
+            for key in _OF_FILES
+            if isinstance(settings.get(key), str)
+            for each in _OF_FILES[key]
+        ]
+        if read:  # a file may have changed between two runs that name it
+            check_files(place, summary, PROBLEM)
+            settings[CONTENT] = digest_of(place / PROBLEM, read)[:8]
         run = FinishedRun(name, settings, figures, _references(summary), curve)
         return checked(run), summary
 

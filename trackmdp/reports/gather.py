@@ -14,7 +14,7 @@ from typing import Any
 
 from trackmdp.errors import UserError
 from trackmdp.reports.finished import read_map, read_run
-from trackmdp.reports.grouping import Study, study
+from trackmdp.reports.grouping import Study, changed, study
 from trackmdp.reports.results import Anomaly, FinishedRun, Mapped, Results
 from trackmdp.training.folders import FAILED_FILE, PLAN, PLAN_BYTES, SUMMARY, run_of
 from trackmdp.untrusted import decoded, known_object, printable
@@ -37,19 +37,22 @@ def gather_runs(folder: Path) -> Results:
         )
     lost: list[Anomaly] = []
     copies: list[Anomaly] = []
-    found: dict[str, tuple[FinishedRun, Mapping[str, Any]]] = {}  # by the digest of the config
+    found: dict[str, tuple[FinishedRun, Mapping[str, Any]]] = {}  # by all that decides a run
     for name in names:
         try:
             run, summary = _read(folder / name, name)
         except UserError as error:
             lost.append(_anomaly(folder, name, error))
             continue
-        first, _ = found.setdefault(str(summary["config_sha256"]), (run, summary))
+        key = json.dumps({**run.settings, "quiet": ""}, sort_keys=True)
+        first, _ = found.setdefault(key, (run, summary))
         if first is not run:  # a copied folder would count one seed twice
             copies.append(Anomaly(name, f"the same config as {first.name}, which counts"))
     runs, summaries = [run for run, _ in found.values()], [each for _, each in found.values()]
     maps, unread = _maps(folder, study(runs))
-    anomalies = [*lost, *copies, *_other_versions(runs, summaries), *unread]
+    other = "another world: a file that it names, as kernel.path, held something else than for"
+    worlds = [Anomaly(name, f"{other} {known}") for name, known in changed(runs).items()]
+    anomalies = [*lost, *copies, *worlds, *_other_versions(runs, summaries), *unread]
     return Results(runs, maps, anomalies, _manifest(plan, len(lost), runs, summaries))
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import chain, product
 from typing import Any
 
-from trackmdp.reports.results import FinishedRun
+from trackmdp.reports.results import CONTENT, FinishedRun
 
 # Order of legends and tables; other algorithms follow.
 ORDER = ("a2c", "hindsight", "ppo", "dqn", "model_based")
@@ -113,6 +113,19 @@ def _known(values: Iterable[float | None]) -> list[float]:
     return [value for value in values if value is not None and math.isfinite(value)]
 
 
+def changed(runs: Sequence[FinishedRun]) -> dict[str, str]:
+    """Name of a run -> that of an earlier one whose options name the same files, which held something else then."""
+    first: dict[str, FinishedRun] = {}
+    found = {}
+    for run in runs:
+        world, _ = _parted(run.settings)
+        key = json.dumps({**world, CONTENT: ""}, sort_keys=True)
+        known = first.setdefault(key, run)
+        if known.settings.get(CONTENT) != run.settings.get(CONTENT):
+            found[run.name] = known.name
+    return found
+
+
 def study(runs: Sequence[FinishedRun]) -> Study:
     """Group runs; a label names the options that differ between them."""
     telling = _telling(runs)
@@ -196,11 +209,12 @@ def _varied(settings: Sequence[Options], head: str) -> list[str]:
         return len({tuple(each.get(key) for key in keys) for each in texts})
 
     kept = [head]
-    for key in dict.fromkeys(key for each in settings for key in each):
+    for key in dict.fromkeys(key for each in settings for key in each if key != CONTENT):
         # As many triples as pairs: the value of `key` follows from the other two.
         if all(values(head, other, key) > values(head, other) for other in kept):
             kept.append(key)
-    return kept[1:]
+    # Of each file its name says enough, unless it has changed.
+    return [*kept[1:], *([CONTENT] if values(*kept, CONTENT) > values(*kept) else [])]
 
 
 def _label(options: Options, head: str, keys: Sequence[str]) -> str:

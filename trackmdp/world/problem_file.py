@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
@@ -64,8 +64,23 @@ def problem_bytes(problem: Subject, classes: IndexArray | None = None) -> bytes:
 
 def problem_digest(problem: Subject, classes: IndexArray | None = None) -> str:
     """SHA-256 of all arrays of a problem, independent of their compression. Arguments as of `problem_arrays`."""
+    return _digest(problem_arrays(problem, classes))
+
+
+def digest_of(file: Path, arguments: Collection[str]) -> str:
+    """SHA-256 of the arrays of some arguments in a `problem.npz`.
+
+    Raises:
+        UserError: the file is missing or damaged.
+    """
+    with opened(file, most=LARGE) as stream, decoded(str(file), "a world or recorded tracks"):
+        arrays = load_npz(stream)
+    return _digest({name: arrays[name] for name in arrays if name.partition(".")[0] in arguments})
+
+
+def _digest(arrays: Arrays) -> str:
     digest = hashlib.sha256()
-    for name, array in problem_arrays(problem, classes).items():
+    for name, array in arrays.items():
         digest.update(f"{name} {array.dtype} {array.shape}".encode())
         digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
