@@ -137,3 +137,17 @@ def test_a_run_cannot_be_told_to_go_on_elsewhere() -> None:
     assert jobs[0].refusal.startswith(
         f"resume={Path.cwd() / 'runs/a'}: expected null or auto in a sweep"
     )
+
+
+def test_a_file_with_another_content_makes_other_runs(tmp_path: Path) -> None:
+    file = tmp_path / "motion.csv"
+    words = ("kernel=table", f"kernel.path={file}", "grid.size=1", "seed=0,1")
+    missing = planned([], *words)
+    file.write_text("0.5")
+    first = planned([], *words)
+    file.write_text("0.75")
+    other = planned([], *words)
+    file.write_text("0.5")
+    assert planned([], *words) == first
+    assert len({*missing, *first, *other}) == 6
+    assert {name.rpartition("-")[0] for name in other} == {"seed_0", "seed_1"}

@@ -21,7 +21,7 @@ from rich.progress import track
 
 from trackmdp.app.words import MOST, Compose, parsed, single_words
 from trackmdp.config import ROOTS, CommandConfig, TrainConfig, to_dict
-from trackmdp.config.checks import refuse_ignored
+from trackmdp.config.checks import by_content, refuse_ignored
 from trackmdp.config.compose import composed_values, config_of
 from trackmdp.config.registry import unresolved
 from trackmdp.config.resume import by_key, fixed_options, key_of
@@ -161,7 +161,7 @@ def plan(
             cfg = cfg and _resumable(cfg)
         except UserError as error:
             cfg, refusal = None, str(error)
-        # Words and config: where a default in conf/ has changed, the same words make another run.
+        # Words and config: where a default in conf/, or a file, has changed, the same words make another run.
         key = _digest(_distinguishing(words), _identity(cfg))
         text = _slug([word for word in words if key_of(word) in naming] or words)
         # A wider grid varies more options, so the readable part of a run's name may change; its digest does not, and
@@ -229,10 +229,10 @@ def _digest(*told: Any) -> str:
 
 
 def _identity(cfg: CommandConfig | None) -> dict[str, Any]:
-    """The options by which two configs count as different runs; empty for a config that was refused."""
+    """The options, and contents of files, by which two configs are different runs; empty for a refused config."""
     # Options that may change when a run is resumed do not make another run; typed ones do, as words.
     if isinstance(cfg, TrainConfig):
-        return fixed_options(cfg)
+        return fixed_options(by_content(cfg))
     return (
         {} if cfg is None else {key: value for key, value in to_dict(cfg).items() if key != "quiet"}
     )
