@@ -81,7 +81,7 @@ def test_a_missing_run_is_named_in_one_line_and_in_the_page(
     (cut / "a2c-0.16-1/summary.json").write_text("{")
     assert main(["report", f"sweep={cut}"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "missing or mixed: a2c-0.16-0: cut: it has no summary.json and 1 more"
+    assert lines[0] == ("missing or mixed, the first of 2: a2c-0.16-0: cut: it has no summary.json")
     assert lines[1].startswith("10 runs; report in")
     page = (cut / "report/report.html").read_text(encoding="utf-8")
     assert "a2c-0.16-1" in page
@@ -144,10 +144,8 @@ def test_a_sweep_as_typed_is_reported_with_what_failed(capsys: pytest.CaptureFix
     capsys.readouterr()
     assert main(["report", "sweep=all"]) == 0, capsys.readouterr().err
     lines = capsys.readouterr().out.splitlines()
-    assert (
-        "failed: grid.size=0: expected an integer >= 1, or a pair of them (cells) and 1 more"
-        in lines[0]
-    )
+    assert lines[0].startswith("missing or mixed, the first of 2: ")
+    assert "failed: grid.size=0: expected an integer >= 1, or a pair of them (cells)" in lines[0]
     assert lines[1].startswith("2 runs; report in")
     page = Path("all/report/report.html").read_text(encoding="utf-8")
     assert "2 of 4 planned runs" in page

@@ -87,6 +87,6 @@ def _write(report: Report, folder: Path) -> None:
 def _tell(console: Console, found: Results, folder: Path) -> None:
     if found.anomalies:
         first = found.anomalies[0]
-        more = f" and {len(found.anomalies) - 1} more" if len(found.anomalies) > 1 else ""
-        console.print(f"missing or mixed: {first.run}: {first.text}{more}")
+        more = f", the first of {len(found.anomalies)}" if len(found.anomalies) > 1 else ""
+        console.print(f"missing or mixed{more}: {first.run}: {first.text}")
     console.print(f"{counted_words(len(found.runs), 'run')}; report in {folder / 'report.html'}")
