@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import shutil
 import signal
 from collections.abc import Generator
 from pathlib import Path
@@ -142,6 +143,31 @@ def test_after_a_failed_trial_another_one_is_tried(here: Path) -> None:
     refused = ["cost.sensor=interval(-2,-1)", "hydra.sweeper.n_trials=3"]
     assert swept("hydra/sweeper=optuna", "quiet=true", *refused) == 2
     assert states(here / "all") == ["failed"] * 3
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        ["grid.t_max=2"],  # another world
+        ["hydra.sweeper.objective=regret_per_step"],
+        [],  # the same, yet runs of the study were removed
+    ],
+)
+def test_a_study_of_other_runs_does_not_go_on(
+    other: list[str],
+    here: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    stub(monkeypatch, "train", peak)
+    assert searched("hydra.sweeper.n_trials=2") == 0
+    if not other:
+        shutil.rmtree(runs_of(here / "all")[0].folder)
+    before = (here / "all/sweep.json").read_bytes()
+    assert searched("hydra.sweeper.n_trials=3", *other) == 2
+    assert "another search" in capsys.readouterr().err
+    assert (here / "all/sweep.json").read_bytes() == before
+    assert searched("hydra.sweeper.n_trials=1", "hydra.sweeper.study=anew", *other) == 0
 
 
 def test_the_objective_may_be_the_regret(here: Path) -> None:

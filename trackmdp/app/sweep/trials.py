@@ -33,7 +33,7 @@ from trackmdp.untrusted import reason
 STUDY = "study.db"
 """File in the sweep's folder that holds the study, where no other storage is named."""
 
-_OTHER = "hydra.sweeper.storage: the study is one of another search"
+_OTHER = "hydra.sweeper.study: the study is one of another search"
 _DIRECTIONS = {"aihtr": "maximize", "regret_per_step": "minimize"}
 
 
@@ -62,8 +62,15 @@ def trials(
 
     with _study(cfg, folder) as study:
         earlier = [job_of(trial) for trial in _completed(study)]
+        here = [job for job in earlier if job.folder.is_dir()]
+        # A study of the folder's own knows no other runs: these would guide the search, and stand in no table.
+        if cfg.storage is None and len(here) < len(earlier):
+            raise UserError(
+                f"{_OTHER} (other words, or another file, than those of this line; or its runs were removed), expected "
+                "another hydra.sweep.dir, or hydra.sweeper.study=NAME beside it"
+            )
         # Handed over as a batch of its own: the sweep finds them done, and they stand in its table.
-        if here := [job for job in earlier if run_of(job.folder).state == "done"]:
+        if here:
             yield here
         # Failures of earlier calls do not count: the user has perhaps removed the cause, and they are tried
         # once more.
@@ -184,6 +191,8 @@ def _study(cfg: OptunaConfig, folder: Path) -> Iterator[Any]:
         study = optuna.create_study(
             study_name=cfg.study, storage=storage, direction=way, load_if_exists=True
         )
+        if study.direction.name.lower() != way:
+            raise UserError(f"{_OTHER} (hydra.sweeper.objective is not {cfg.objective})")
         _enqueue_interrupted(study)
         yield study
     finally:
