@@ -263,7 +263,7 @@ def test_ctrl_c_at_any_line_keeps_each_price_with_its_bound() -> None:
             raise KeyboardInterrupt
         return traced
 
-    for line in passed:
+    for line in passed:  # noqa: B007 (read by `traced`)
         calls, lines, before = itertools.count(), itertools.count(), sys.gettrace()
         sys.settrace(traced)
         try:
@@ -286,7 +286,6 @@ def test_ctrl_c_at_any_line_keeps_each_price_with_its_bound() -> None:
         (small(None), {"near": float("nan")}, "near=nan: expected"),
         (small(None), {"near": "2"}, "near=2: expected"),
         (small(None), {"depht": 3}, "solver.depht: unknown option"),
-        (replace(small(None), budget=1), {}, "budget=1: expected None"),
         (replace(small(None), max_steps=9), {}, "max_steps=9: .* expected null"),
         (replace(small(None), reward=0.0), {}, "reward=0: expected"),
         (World(np.zeros((4, 4)), 2, cost=0.1, t_max=0), {}, "kernel: the target leaves"),
