@@ -87,14 +87,26 @@ def test_outside_the_main_thread_signals_are_not_touched() -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1])
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ("trackmdp.training.trainer.seed_global", "hydra.run.dir="),
+        ("trackmdp.app.launch.read_write", "hydra.run.dir="),
+        ("trackmdp.app.prepare.os.access", "hydra.run.dir="),
+        ("trackmdp.app.sweep.sweep.sweep", "-m hydra.sweep.dir="),
+        ("trackmdp.app.sweep.sweep.locked", "-m hydra.sweep.dir="),
+    ],
+)
 def test_before_training_a_signal_leaves_no_folder(
-    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    place: str,
+    words: str,
+    number: signal.Signals,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    place = "trackmdp.training.trainer.seed_global"
-    monkeypatch.setattr(place, lambda seed: signal.raise_signal(number))
+    monkeypatch.setattr(place, lambda *_: signal.raise_signal(number))
     folder = tmp_path / "a" / "b"
-    words = ["train", "grid.size=3", "quiet=true", f"hydra.run.dir={folder}"]
     with handled(lambda *_: None, number), pytest.raises(SystemExit) as ended:
-        main(words)
+        main(["train", "grid.size=3", "quiet=true", *f"{words}{folder}".split()])
     assert ended.value.code == 128 + number
     assert not folder.parent.exists()

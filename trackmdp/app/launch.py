@@ -11,7 +11,7 @@ import shlex
 import signal
 import sys
 from collections.abc import Generator, Sequence
-from contextlib import redirect_stdout
+from contextlib import closing, nullcontext, redirect_stdout
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -29,9 +29,8 @@ from trackmdp.app.prepare import (
     Prepared,
     announce,
     folder_of,
-    make_folder,
+    made_folder,
     prepare,
-    remove_if_empty,
     say,
 )
 from trackmdp.app.words import gathered, parsed, run_words
@@ -64,10 +63,9 @@ def launch(command: str, words: Sequence[str]) -> int:
         # Before anything is checked or made: `--cfg job` also shows a config that a run would refuse.
         if answer(compose, args):
             return 0
-        if args.multirun or "hydra.mode=MULTIRUN" in args.overrides:
-            return _sweep(compose)
+        many = args.multirun or "hydra.mode=MULTIRUN" in args.overrides
         with handled(leave, signal.SIGTERM, signal.SIGUSR1):
-            return _run_once(compose)
+            return _sweep(compose) if many else _run_once(compose)
 
 
 def _run_once(compose: Composer) -> int:
@@ -84,19 +82,16 @@ def _run_once(compose: Composer) -> int:
     ready = prepare(compose.command, cfg, run_words(compose.words))
     # Files of a replay have names of their own, most of them elsewhere.
     written = compose.command != "replay"
-    made = make_folder("hydra.run.dir", ready.folder, written=written)
-    # Hydra marks its part read-only once it is composed.
-    with read_write(cfg.hydra):
-        cfg.hydra.run.dir = str(ready.folder)  # a run that is resumed writes to its own
-    try:
+    # A run that failed before its first file leaves nothing; one that wrote something keeps it.
+    with made_folder("hydra.run.dir", ready.folder, written=written):
+        # Hydra marks its part read-only once it is composed.
+        with read_write(cfg.hydra):
+            cfg.hydra.run.dir = str(ready.folder)  # a run that is resumed writes to its own
         announce(ready)
         grids = OmegaConf.select(cfg, "hydra.sweeper.blocks")  # a single run does not read them
         if grids and not ready.cfg.quiet:
             say("one run with the defaults: -m is missing, which runs all that this config plans")
         _run_in_hydra(cfg, ready)
-    finally:
-        # A run that failed before its first file leaves nothing; one that wrote something keeps it.
-        remove_if_empty(made)
     return 0
 
 
@@ -145,15 +140,11 @@ def _sweep(compose: Composer) -> int:
     )
     batches = maker(sweeper)(sweeper, run_words(compose.words), place, planned)
     line = shlex.join(["trackmdp", command, "-m", *compose.words])
-    made = make_folder("hydra.sweep.dir", folder)
-    try:
+    # A search lets go of its study, which it no longer can at Python's end.
+    ends = closing(batches) if isinstance(batches, Generator) else nullcontext()
+    with made_folder("hydra.sweep.dir", folder), ends:
         # A grid has been composed and checked to the last run by now; a search plans its runs as it goes.
         return sweep(place, command, line, batches, partial(maker(launcher), launcher), console)
-    finally:
-        # A search lets go of its study, which it no longer can at Python's end.
-        if isinstance(batches, Generator):
-            batches.close()
-        remove_if_empty(made)
 
 
 def _register_name(compose: Composer, cfg: DictConfig) -> None:

@@ -6,7 +6,8 @@ import errno
 import importlib
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -285,27 +286,29 @@ def folder_of(cfg: DictConfig, key: str) -> Path:
     return folder
 
 
-def make_folder(key: str, folder: Path, *, written: bool = True) -> list[Path]:
-    """Make `folder`; returns the folders that were not there before, the innermost first.
+@contextmanager
+def made_folder(key: str, folder: Path, *, written: bool = True) -> Iterator[None]:
+    """Make `folder`; of the folders that were not there before, those left empty are removed afterwards.
 
     Raises:
-        UserError: it cannot be made, or not be written to though `written` says that it is to be. Nothing is left
-            behind then.
+        UserError: it cannot be made, or not be written to though `written` says that it is to be.
     """
-    # Noted before anything is made, so that exactly these are taken away again.
+    # Noted before anything is made, so that exactly these are taken away again, also after a signal at any moment.
     path = folder.absolute()
     made = [each for each in (path, *path.parents) if not each.exists()]
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        # A folder that was there already may be read-only: mkdir does not complain, the first file would.
-        if written and not os.access(folder, os.W_OK | os.X_OK):
-            raise PermissionError(errno.EACCES, "it cannot be written to")
-    except OSError as error:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            # A folder that was there already may be read-only: mkdir does not complain, the first file would.
+            if written and not os.access(folder, os.W_OK | os.X_OK):
+                raise PermissionError(errno.EACCES, "it cannot be written to")
+        except OSError as error:
+            raise UserError(
+                f"{key}={folder}: expected a folder that can be written to ({error.strerror})"
+            ) from error
+        yield
+    finally:
         remove_if_empty(made)
-        raise UserError(
-            f"{key}={folder}: expected a folder that can be written to ({error.strerror})"
-        ) from error
-    return made
 
 
 def remove_if_empty(folders: Iterable[Path]) -> None:
