@@ -18,7 +18,7 @@ from trackmdp.app.sweep import launchers
 from trackmdp.cluster import joining, ray_options
 from trackmdp.config.sweeping import RayConfig
 from trackmdp.errors import Preempted, UserError
-from trackmdp.signals import handled, stop
+from trackmdp.signals import Signals, handled, stop
 
 BLOCKS = "solve grid.size=4 partition.block=2"
 
@@ -110,6 +110,19 @@ def test_sigterm_that_ray_took_over_acts_as_before(error: type[Exception] | None
         assert signal.getsignal(signal.SIGTERM) == before
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@pytest.mark.parametrize("ends", [SystemExit(15), KeyboardInterrupt()])
+def test_a_sweep_that_notes_sigterm_while_ray_starts_ends(ends: BaseException) -> None:
+    """Ray did not start: the sweep cannot go on to its runs, nor end with a status of Ray's."""
+
+    def of_ray(*_: object) -> None:
+        raise ends
+
+    with Signals() as noted, pytest.raises(Preempted, match="signal 15"), joining("x", None):
+        signal.signal(signal.SIGTERM, of_ray)
+        signal.raise_signal(signal.SIGTERM)
+    assert noted.received == signal.SIGTERM
 
 
 @pytest.mark.parametrize("ends", [SystemExit(15), KeyboardInterrupt(), None])

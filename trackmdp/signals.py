@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator
@@ -46,6 +47,9 @@ def kept(number: signal.Signals) -> Iterator[None]:
     """Others may handle a signal inside; afterwards the handler from before does, also of one that came meanwhile.
 
     Outside the main thread nothing is changed.
+
+    Raises:
+        Preempted: others ended the body for it, and the handler from before only notes it.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -65,6 +69,8 @@ def kept(number: signal.Signals) -> Iterator[None]:
         os.close(note)
         if number in heard:
             signal.raise_signal(number)
+            if isinstance(sys.exception(), (SystemExit, KeyboardInterrupt)):
+                raise Preempted(number)
 
 
 class Signals(ExitStack):
