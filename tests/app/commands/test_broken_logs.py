@@ -7,6 +7,7 @@ import errno
 import os
 import resource
 import shlex
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -143,17 +144,27 @@ def test_an_evaluation_outlives_its_log(
     assert (tmp_path / "evaluation.json").is_file()
 
 
-def test_ctrl_c_while_logging_names_the_part_and_how_to_save_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_logging_names_the_part_and_how_to_save_it(
+    number: signal.Signals,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     def stopped(writer: EpisodeWriter) -> Path:
-        raise KeyboardInterrupt
+        signal.raise_signal(number)
+        raise AssertionError
 
+    words, status = [*LOGGED, f"hydra.run.dir={tmp_path / 'my runs'}"], 0
     with monkeypatch.context() as patch:
         patch.setattr(EpisodeWriter, "finish", stopped)
-        assert main([*LOGGED, f"hydra.run.dir={tmp_path / 'my runs'}"]) == 130
-    said, last = capsys.readouterr().err.splitlines()
-    assert last == "trackmdp evaluate: interrupted"
+        try:
+            status = main(words)
+        except SystemExit as ended:  # without a line of its own
+            status = ended.code
+    assert status == 128 + number
+    said, *last = capsys.readouterr().err.splitlines()
+    assert last == (["trackmdp evaluate: interrupted"] if number is signal.SIGINT else [])
     part = tmp_path / "my runs" / "episodes.mcap.part"
     assert said.startswith(f"trackmdp evaluate: {part}: cut off")
     assert main(shlex.split(said.split("`")[1])[1:]) == 0

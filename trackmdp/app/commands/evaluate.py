@@ -169,7 +169,7 @@ def _log(
     try:
         log.add(episodes, {"label": subject})
         whole = log.close()
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit):  # of Ctrl-C, or of another signal
         log.abandon()
         line = f"trackmdp replay {shlex.quote(f'file={log.part}')} recover=true"
         _tell(f"{log.part}: cut off; `{line}` saves its episodes")
