@@ -80,8 +80,8 @@ def _run_once(compose: Composer) -> int:
         raise UserError("resume=auto: expected hydra.run.dir=FOLDER beside it, the run's own")
     # All checks come first, so that a mistyped line leaves no folder behind.
     ready = prepare(compose.command, cfg, run_words(compose.words))
-    # Files of a replay have names of their own, most of them elsewhere.
-    written = compose.command != "replay"
+    # Files of a replay have names of their own, most of them elsewhere; a sweep that is watched may be another user's.
+    written = compose.command != "replay" and not getattr(ready.cfg, "watch", False)
     # A run that failed before its first file leaves nothing; one that wrote something keeps it.
     with made_folder("hydra.run.dir", ready.folder, written=written):
         # Hydra marks its part read-only once it is composed.

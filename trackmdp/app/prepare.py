@@ -85,7 +85,10 @@ def prepare(command: str, composed: DictConfig, words: Sequence[str]) -> Prepare
     cfg = config_of(values, schema, rules=not resumes)
     if not resumes:
         refuse_ignored(cfg, by_key(words))
-    prepared = check(command, cfg, folder_of(composed, "hydra.run.dir"), words)
+    # Where a sweep is watched no folder for a report is made.
+    watched = isinstance(cfg, config.ReportConfig) and cfg.watch
+    folder = Path(cfg.sweep) if watched else folder_of(composed, "hydra.run.dir")
+    prepared = check(command, cfg, folder, words)
     if resumes:  # a run that goes on has a config of its own
         refuse_ignored(prepared.cfg, by_key(words))
     _check_here(prepared.cfg, prepared.folder)

@@ -151,3 +151,14 @@ def test_a_sweep_as_typed_is_reported_with_what_failed(capsys: pytest.CaptureFix
     assert "2 of 4 planned runs" in page
     assert "trackmdp train -m seed=0,1 grid.size=3,0" in page
     assert str(Path.cwd()) not in page
+
+
+def test_to_watch_a_sweep_nothing_is_written(
+    sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A file in the place of the report's folder stands for a sweep of somebody else's, which cannot be written to."""
+    own = shutil.copytree(sweep, tmp_path / "own", ignore=shutil.ignore_patterns("report"))
+    (own / "report").touch()
+    before = own.stat().st_mtime_ns
+    assert main(["report", f"sweep={own}", "watch=true"]) == 0, capsys.readouterr().err
+    assert own.stat().st_mtime_ns == before
