@@ -54,6 +54,14 @@ def test_one_set_ahead_is_qmdp_or_the_clocked_policy(world: World) -> None:
         )
 
 
+def test_a_unit_of_rewards_changes_no_plan_ahead() -> None:
+    """A factor of 2^-30 changes the exponents of floats alone."""
+    world, unit = paper_world(5, 0.22, 2), 2.0**-30
+    paid = {name: getattr(world, name) * unit for name in ("cost", "safe_cost", "reward")}
+    one, other = (lookahead.solve(each) for each in (world, world.but(**paid)))
+    assert (one.dense() == other.dense()).all()
+
+
 @pytest.mark.parametrize(("depth", "expected"), [(2, 88.99323840082147), (3, 90.48447404404875)])
 def test_sets_ahead_close_the_gap(depth: int, expected: float) -> None:
     """Z = 5, c = 0.22, t_max = 2: the clocked policy earns -23.8; planned to the safe action, the optimum 90.4845."""

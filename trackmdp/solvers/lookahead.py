@@ -21,6 +21,7 @@ from trackmdp.world.model import World
 Tail: TypeAlias = Literal["qmdp", "clocked"]
 
 _SLACK = 1e-9
+"""Worth of a plan that may be missed, in rewards."""
 _MOST_NODES = 2_000_000
 """Choices looked at per plan; a count, not a time, so that the same world gives the same policy."""
 
@@ -61,11 +62,9 @@ def solve(world: World, *, depth: int = 2, tail: Tail = "clocked") -> PolicyTabl
 def _first_set(problem: InnerProblem, mass: Array, states: IndexArray) -> BoolArray:
     """`[G, 1]` the first set of the best plan from each located cell; `mass` `[E]` is undetected in `states` `[E]`."""
     world, run = problem.world, up_to(_MOST_NODES)
-    cellwise = has_trees(world)
+    cellwise, slack = has_trees(world), _SLACK * world.reward
     # Without trees optimism is that of a search that is left after one more miss.
-    known = (
-        tables(problem, slack=_SLACK, run=run) if cellwise else [problem.missed] * problem.length
-    )
+    known = tables(problem, slack=slack, run=run) if cellwise else [problem.missed] * problem.length
     plans, sets = first_guess(problem, known, mass)
     sets = exchange(plans, sets, np.ones(world.num_cells, dtype=bool))
     if not cellwise:
@@ -74,6 +73,6 @@ def _first_set(problem: InnerProblem, mass: Array, states: IndexArray) -> BoolAr
     place = problem.turns[0].before, states
     here = sparse.csr_array((mass, place), shape=(world.num_cells, world.num_cells))
     here.eliminate_zeros()
-    tree = Tree(problem, known, plans.worth_of(sets), _SLACK, here)
+    tree = Tree(problem, known, plans.worth_of(sets), slack, here)
     run(tree)
     return (adopted(problem, sets, tree, mass) or sets)[0]
