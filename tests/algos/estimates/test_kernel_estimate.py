@@ -163,24 +163,40 @@ def test_sets_that_never_show_some_moves_still_tell_them() -> None:
     np.testing.assert_allclose(estimate.mean().toarray()[:, :4], KERNEL, atol=0.03)
 
 
-@pytest.mark.parametrize(("shown", "least", "most"), [(set(), 49, 400), ({0, 1, 2}, 2, 12)])
+@pytest.mark.parametrize(("shown", "least", "most"), [(set(), 20, 48), ({0, 1, 2}, 2, 12)])
 def test_rounds_go_on_until_the_counts_settle(
     shown: set[int], least: int, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every path hides one cell. It may be any, which takes many rounds, or must be the one that three others left."""
+    """Every path hides one cell. It may be any, which takes many rounds, or must be the one that three others left.
+
+    Leaps lead to where single rounds do.
+    """
     rounds = []
 
     def counted(*given: Any) -> Any:
         rounds.append(expected_moves(*given))
         return rounds[-1]
 
+    def fitted() -> KernelEstimate:
+        estimate = KernelEstimate(2, weight=0.1, exit_weight=1.0)
+        estimate.add(paths_of([(start, [shown], end) for start, _, end in simulated(2000, 3)]))
+        estimate.fit(400)
+        return estimate
+
     monkeypatch.setattr(kernel_estimate, "expected_moves", counted)
-    estimate = KernelEstimate(2, weight=0.1, exit_weight=1.0)
-    estimate.add(paths_of([(start, [shown], end) for start, _, end in simulated(2000, 3)]))
-    estimate.fit(400)
+    counts = fitted().counts
     assert least <= len(rounds) <= most
-    moved = abs(rounds[-1] - rounds[-2]).sum() / estimate.counts.sum()
-    assert moved < 1e-4
+    assert abs(rounds[-1] - rounds[-2]).sum() / counts.sum() < 1e-4
+    monkeypatch.setattr(kernel_estimate, "_leap", lambda *line: line[-1])
+    assert abs(fitted().counts - counts).sum() / counts.sum() < 2e-3
+
+
+def test_a_leap_goes_to_the_end_of_changes_that_shrink_and_never_below_nothing() -> None:
+    """Changes of 2 and 1 lead 4 further; those of 2 and 1.8, ten times 2 further, would leave nothing of the first."""
+    ends = (([4, 6], [6, 4], [7, 3], [8, 2]), ([5, 5], [3, 7], [1.2, 8.8], [0.12, 25]))
+    for *line, end in ends:
+        found = kernel_estimate._leap(*(sparse.csr_array([each]) for each in line)).toarray()[0]
+        np.testing.assert_allclose(found, 10 * np.array(end) / np.sum(end))
 
 
 @pytest.mark.slow
