@@ -5,6 +5,8 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -15,7 +17,7 @@ import pytest
 from scipy import sparse
 
 import trackmdp as tm
-from tests.typed import typed
+from tests.typed import ENVIRONMENT, typed
 from trackmdp.app.cli import main
 from trackmdp.config.compose import compose
 from trackmdp.errors import Preempted, UserError
@@ -346,6 +348,26 @@ def test_a_worker_may_die_while_jobs_are_handed_out(tmp_path: Path) -> None:
 def test_a_job_that_kills_every_worker_ends_in_one_line(tmp_path: Path) -> None:
     with crew(2) as run, pytest.raises(UserError, match="workers died 3 times"):
         run(Dies(tmp_path, always=True), [2])
+
+
+@pytest.mark.slow
+def test_a_script_that_workers_run_anew_ends_in_one_line(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    lines = (
+        "import trackmdp as tm",
+        'world = tm.make_world("random_walk", size=5)',
+        "tm.solve(world, block=3, workers=2)",
+    )
+    script.write_text("\n".join(lines))
+    done = subprocess.run(
+        [sys.executable, script], env=ENVIRONMENT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert done.stderr.count("Traceback") == 1
+    assert done.stderr.splitlines()[-1] == (
+        "trackmdp.errors.UserError: partition.workers=2: each worker runs your script anew, expected its calls below "
+        'if __name__ == "__main__":'
+    )
 
 
 def test_a_policy_of_another_grid_cannot_be_put_together() -> None:

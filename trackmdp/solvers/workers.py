@@ -25,6 +25,8 @@ Result = TypeVar("Result")
 
 _ATTEMPTS = 3
 """Times that a job is begun, if the worker that has it dies, before all is given up."""
+_RUN_ANEW = 78
+"""Exit code of a worker that would begin workers of its own while it starts."""
 
 
 class Crew(Protocol):
@@ -98,7 +100,13 @@ def _processes(workers: int) -> Iterator[Crew]:
                     results[number] = future.result()
             if len(results) == len(jobs):
                 return [results[number] for number in range(len(jobs))]
+            dead = list((pool._processes or {}).values())
             pool.shutdown()
+            if any(worker.exitcode == _RUN_ANEW for worker in dead):
+                raise UserError(
+                    f"partition.workers={workers}: each worker runs your script anew, expected its calls below "
+                    'if __name__ == "__main__":'
+                )
             pool = _pool(workers)
         raise UserError(
             f"partition.workers={workers}: workers died {_ATTEMPTS} times, expected enough memory for each"
@@ -121,6 +129,9 @@ _ended: list[Preempted] = []
 
 
 def _pool(workers: int) -> ProcessPoolExecutor:
+    # A spawned process imports the main script; calls there that are not guarded come here again.
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        os._exit(_RUN_ANEW)
     with starting():
         # Spawned, not forked: a fork copies locks that another thread of this process may hold.
         return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), end_with_parent)
