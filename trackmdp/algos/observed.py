@@ -49,7 +49,8 @@ def observed_paths(batch: TensorDictBase, task: Task, *, last: bool = False) -> 
     """The paths that end in a collected batch `[B, time]`, row by row.
 
     Where a detection reveals the mode they are of keys, and a sensor sees all those of its cell. Where the safe action
-    may miss, a path that comes to it ends with its last set, unless `last`.
+    may miss, a path that comes to it ends with its last set, unless `last`; so does one of an episode that is truncated
+    after a miss: to keep the others alone would favour the sensed cells.
 
     Args:
         batch: of any sets.
@@ -58,15 +59,19 @@ def observed_paths(batch: TensorDictBase, task: Task, *, last: bool = False) -> 
     """
     after, name = batch["next"], "last_cell" if last else known_as(batch)
     outside, classes = (task.num_cells, 1) if last else (task.num_keys, task.keys.num_classes)
-    ended = path_ends(batch)
-    exited = after["terminated"].squeeze(-1)
-    cell, misses = (batch[key][ended] for key in ("last_cell", "steps_since_detection"))
+    found = path_ends(batch)
+    cut = after["done"].squeeze(-1) & ~found & (not last)
+    ended, clock = found | cut, batch["steps_since_detection"]
+    exited, cell = after["terminated"].squeeze(-1), batch["last_cell"][ended]
+    misses = torch.where(cut, after["steps_since_detection"], clock)[ended]
     end = torch.where(exited, outside, after[name])[ended]
-    if not (task.safe or last):
-        end = torch.where(misses == task.num_choices, outside + 1, end)
-    # A path's sets are in the history of the step that ended it, wherever the batch began. Most paths have no miss.
+    forced = (misses == task.num_choices) & (not (task.safe or last))
+    end = torch.where(cut[ended] | forced, outside + 1, end)
+    # A path's sets are in the history of the step that ended it, wherever the batch began, or of the state in which its
+    # episode was truncated. Most paths have no miss.
     missed = misses.nonzero().squeeze(-1)
-    history = batch["action_history"][ended & (batch["steps_since_detection"] > 0)]
+    history = batch["action_history"][found & (clock > 0) | cut]
+    history[cut[ended][missed]] = after["action_history"][cut]
     path, miss, sensor = history.nonzero(as_tuple=True)
     if task.window is not None and task.coverage is None:  # numbered within the window
         sensor = Window.of(task, sensor.device).around(cell[missed])[path, sensor]
