@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -151,6 +152,26 @@ def test_methods_that_ran_in_other_worlds_are_named_beside_their_means() -> None
     runs = [run(f"{a}{c}", f"algo={a}", options={"cost.sensor": c}, **figures) for a, c in pairs]
     assert "not in all worlds: ppo 1 of 2" in outcome_table(study(runs), None).caption
     assert "not in all worlds" not in outcome_table(study(runs[:2]), None).caption
+
+
+def test_the_figures_of_a_reference_are_those_of_one_policy() -> None:
+    """Two searches of different lengths: the policy of the longer one earns more, and senses less."""
+    short = {"aihtr": 98.0, "accuracy": 0.95, "sensors_per_step": 3.0}
+    longer = {"aihtr": 99.0, "accuracy": 0.9, "sensors_per_step": 2.0}
+    runs = [
+        replace(
+            run(str(seed), options={"seed": seed}, aihtr=97.0, optimal_upper=99.5, **EARNED),
+            references={"best known": figures, "clocked bound": {"aihtr": 99.5}},
+        )
+        for seed, figures in enumerate((short, longer, short))
+    ]
+    found = study(runs)
+    (world,) = found.worlds
+    for key, value in longer.items():
+        assert found.reference(world, "best known", key) == value
+    assert found.reference(world, "clocked bound", "aihtr") == 99.5
+    assert found.reference(world, "best known", "regret") == pytest.approx(0.5 / 200)
+    assert math.isnan(found.reference(world, "clocked bound", "accuracy"))
 
 
 def test_a_learned_policy_above_that_of_the_solver_is_the_best_known() -> None:

@@ -30,6 +30,9 @@ _IGNORED = (
     *("log.", "checkpoint.", "evaluation.", "optimal."),
 )
 
+_EARNED = ("aihtr", "held_out_aihtr")
+"""Figures by which a policy is better than another one; on recordings others have the second."""
+
 Options = Mapping[str, Any]
 
 
@@ -74,12 +77,13 @@ class Study:
         return [*filter(None, (self.values(world, method, "regret") for world in self.worlds))]
 
     def reference(self, world: str, name: str, key: str) -> float:
-        """The same of another policy or bound in a world, the largest where runs differ."""
+        """The same of another policy or bound in a world, of the largest AIHTR where runs differ."""
         runs = self.of(world)
         if key == "regret":
             return self.regret(runs[0], world, self.reference(world, name, "aihtr"))
-        found = (run.references.get(name, {}).get(key) for run in runs)
-        return max(_known(found), default=math.nan)
+        found = [run.references.get(name, {}) for run in runs]
+        best = max(found, key=lambda each: max(_known(map(each.get, _EARNED)), default=-math.inf))
+        return math.nan if (value := best.get(key)) is None else value
 
     def upper(self, world: str) -> float:
         """Least proved upper bound on the AIHTR in a world; nan on recordings."""
