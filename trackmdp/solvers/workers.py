@@ -122,8 +122,6 @@ def _processes(workers: int) -> Iterator[Crew]:
         pool.shutdown(cancel_futures=True)  # no further job begins
 
 
-_LATER = {signal.SIGINT, signal.SIGUSR1}
-"""Signals that are blocked while workers start."""
 _ended: list[Preempted] = []
 """In a worker: the signal that ended its last job."""
 
@@ -138,19 +136,23 @@ def _pool(workers: int) -> ProcessPoolExecutor:
 
 
 @contextmanager
-def starting() -> Iterator[None]:
+def starting(*more: signal.Signals) -> Iterator[None]:
     """Block SIGINT and SIGUSR1 while workers start; they, and Python's tracker of semaphores, inherit the mask.
 
     This process notes the signals, ends the workers with SIGTERM, and raises the signals again at the end.
+
+    Args:
+        more: signals to be blocked as well.
     """
+    later = {signal.SIGINT, signal.SIGUSR1, *more}
     heard: list[int] = []
     # A process that gets a signal while it still imports would write a traceback, so would a worker left half started.
     # The handler notes the signal all the same, since another thread may receive it.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _LATER)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, later)
     try:
         with handled(lambda number, _: heard.append(number), *HEARD), safe_children():
             resource_tracker.ensure_running()
-            signal.pthread_sigmask(signal.SIG_BLOCK, _LATER)  # its start has unblocked SIGINT
+            signal.pthread_sigmask(signal.SIG_BLOCK, later)  # its start has unblocked SIGINT
             yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -21,6 +21,7 @@ from trackmdp.app.sweep.process import stop_signal
 from trackmdp.app.sweep.sweep import sweep
 from trackmdp.config.compose import compose
 from trackmdp.errors import Preempted, RunError, UserError
+from trackmdp.signals import Signals
 from trackmdp.training.folders import run_of
 
 __all__ = ["here"]
@@ -70,17 +71,41 @@ def test_a_signal_is_told_to_the_runs_and_ends_the_sweep(tmp_path: Path) -> None
     assert states(tmp_path) == ["waiting"]
 
 
-def test_a_fork_server_that_loads_ignores_the_signals_of_its_group(
+def test_a_fork_server_that_loads_does_not_hear_the_signals_of_its_group(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ctrl-C while it imports torch would end it with a traceback."""
-    seen: list[object] = []
-    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
-    monkeypatch.setattr(
-        process.forkserver, "ensure_running", lambda: seen.extend(map(signal.getsignal, signals))
-    )
-    process.context_for("train")
-    assert seen == [signal.SIG_IGN] * len(signals)
+    """Ctrl-C while it imports torch would end it with a traceback; the sweep hears it."""
+    blocked: list[set[int]] = []
+
+    def begins() -> None:
+        blocked.append(signal.pthread_sigmask(signal.SIG_BLOCK, []))
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(process.forkserver, "ensure_running", begins)
+    with Signals() as sweeping:
+        process.context_for("train")
+    assert blocked[0] >= {signal.SIGINT, signal.SIGTERM, signal.SIGUSR1}
+    assert sweeping.received == signal.SIGTERM
+
+
+class Told(Job):
+    """A run that is asked to stop as soon as its process is there, before it can do anything."""
+
+    def __reduce__(self) -> Any:
+        return _told, (self.sweep, self.cfg)
+
+
+def _told(sweep: Path, cfg: Any) -> Job:
+    os.kill(os.getpid(), signal.SIGTERM)
+    return Job("train", sweep, "one", (), cfg)
+
+
+@pytest.mark.slow
+def test_a_run_hears_what_came_while_its_process_began(tmp_path: Path) -> None:
+    (tmp_path / "one").mkdir()
+    cfg = compose("train", {"grid.size": 3, "quiet": True, "algo.total_frames": 10_000})
+    assert process.run_in_process(Told("train", tmp_path, "one", (), cfg)) == -signal.SIGTERM
+    assert not list((tmp_path / "one").iterdir())
 
 
 def test_a_run_whose_process_cannot_start_is_told_once(

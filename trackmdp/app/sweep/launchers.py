@@ -6,7 +6,6 @@ A launcher reports nothing: the result of each run is in its folder, for runs in
 from __future__ import annotations
 
 import os
-import signal
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -17,7 +16,7 @@ from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.process import fail, run_job, stop_signal
 from trackmdp.cluster import joining, ray_options
 from trackmdp.config import TrainConfig, sweeping
-from trackmdp.signals import handled
+from trackmdp.solvers.workers import starting
 
 # Each names the threads of one library (OpenMP, OpenBLAS, MKL), which by default take all cores, in every run at once.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -57,8 +56,6 @@ def run_joblib(cfg: sweeping.JoblibConfig, jobs: Sequence[Job]) -> None:
     """In threads: each only waits for the process of its run."""
     from joblib import Parallel, delayed
 
-    # In the main thread, before joblib's threads start runs: only there can the fork server be made to ignore signals.
-    process.context_for(jobs[0].command)
     # Cores this process may use, which in a container or a cluster's job are fewer than the machine has.
     at_once = cfg.n_jobs or len(os.sched_getaffinity(0))
     # Threads: joblib's own processes (loky) give up the whole sweep when one of them is killed. `batch_size=1`: a
@@ -128,8 +125,8 @@ def run_here(cfg: sweeping.SubmititLocalConfig, jobs: Sequence[Job]) -> None:
             time.sleep(_POLL)
         if stop_signal(job.sweep):
             break
-        # A process started here ignores Ctrl-C: the sweep receives it and stops them in order.
-        with handled(signal.SIG_IGN, signal.SIGINT):
+        # A process started here does not hear Ctrl-C: the sweep receives it and stops them in order.
+        with starting():
             running.append(executor.submit(Submission(), job))
     _wait(running)
 

@@ -24,8 +24,7 @@ from trackmdp.app.sweep.plan import Job
 from trackmdp.config import TrainConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import FAILED, USER_MISTAKE, Preempted, RunError, UserError
-from trackmdp.signals import handled
-from trackmdp.solvers.workers import end_with_parent
+from trackmdp.solvers.workers import end_with_parent, starting
 from trackmdp.training.folders import DONE, FAILED_FILE, SUMMARY, run_of
 from trackmdp.untrusted import reason
 
@@ -104,19 +103,16 @@ def stop_all() -> None:
 
 
 def context_for(command: str) -> Any:
-    """The `multiprocessing` context that starts runs of `command`; call it first in the main thread.
+    """The `multiprocessing` context that starts runs of `command`.
 
-    The fork server ignores the signals that a terminal or a scheduler sends to the whole process group: a run that it
+    The fork server blocks the signals that a terminal or a scheduler sends to the whole process group: a run that it
     has forked needs it to report how it ended.
     """
     context: Any = multiprocessing.get_context("forkserver")
     # Importing torch takes seconds and memory: the server does it once, and every run of any launcher is forked from
     # it. Forking this process itself would copy its threads' locks in any state; a fork server has one thread.
     context.set_forkserver_preload([f"trackmdp.app.commands.{command}"])
-    # Python sets signal handlers from the main thread alone; hence "call it first in the main thread".
-    ignored = _TERMINATING if threading.current_thread() is threading.main_thread() else ()
-    # SIG_IGN is inherited by the process that is started inside, and a handler of Python's would not be.
-    with handled(signal.SIG_IGN, *ignored):
+    with starting(*_TERMINATING):
         forkserver.ensure_running()
     return context
 
@@ -132,14 +128,11 @@ def _stop(process: Any) -> None:
 
 
 def _run_in_child(job: Job, folder: Path, connection: Connection) -> None:
-    # The fork server ignores these, and a fork inherits that: a run has to hear them, to save and stop.
-    for number in (signal.SIGTERM, signal.SIGUSR1):
-        signal.signal(number, signal.SIG_DFL)
-    for number in (
-        signal.SIGINT,
-        signal.SIGUSR2,
-    ):  # the sweep, or the cluster's job, receives these and passes them on
+    # The sweep, or the cluster's job, receives these and passes them on.
+    for number in (signal.SIGINT, signal.SIGUSR2):
         signal.signal(number, signal.SIG_IGN)
+    # The fork server blocks them, and a fork inherits that: a run has to hear what it was sent meanwhile.
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _TERMINATING)
     # The fork server stays in the folder in which it was started, so that relative paths would be meant from there.
     os.chdir(folder)
     # At the level of the descriptor, so that output of libraries in C goes to the file as well. Errors stay on the
