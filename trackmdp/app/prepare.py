@@ -294,7 +294,7 @@ def made_folder(key: str, folder: Path, *, written: bool = True) -> Iterator[Non
     """Make `folder`; of the folders that were not there before, those left empty are removed afterwards.
 
     Raises:
-        UserError: it cannot be made, or not be written to though `written` says that it is to be.
+        UserError: it cannot be made, or with `written` not be written to.
     """
     # Noted before anything is made, so that exactly these are taken away again, also after a signal at any moment.
     path = folder.absolute()

@@ -14,8 +14,8 @@ class _AtMost(Binary):
     """Bits `[..., sensors]`, of which at most `budget` are 1 in the last dimension.
 
     Each budget has a class of its own (`at_most`), since TorchRL makes new specs of old ones by
-    `self.__class__(n, shape, device, dtype)`. Where the last dimension is another, sets cannot be told apart, and a
-    `Binary` is made.
+    `self.__class__(n, shape, device, dtype)`. Where the last dimension is another, sets have no place of their own, and
+    a `Binary` is made.
     """
 
     budget: ClassVar[int]

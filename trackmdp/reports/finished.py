@@ -39,7 +39,7 @@ _OF_FILES = {
     "sensor.p_d": ("detection",),
     "sensor.p_s": ("safe_detection",),
 }
-"""Options that may name a file -> what is read from it, in `problem.npz`."""
+"""Options that may name a file -> the arguments read from it, in `problem.npz`."""
 _BOUNDS = {"printed bound": "paper", "valid bound": "valid", "clocked bound": "clocked"}
 
 

@@ -118,7 +118,7 @@ def _known(values: Iterable[float | None]) -> list[float]:
 
 
 def changed(runs: Sequence[FinishedRun]) -> dict[str, str]:
-    """Name of a run -> that of an earlier one whose options name the same files, which held something else then."""
+    """Name of a run -> that of an earlier one whose options name the same files, of another content."""
     first: dict[str, FinishedRun] = {}
     found = {}
     for run in runs:
@@ -217,7 +217,7 @@ def _varied(settings: Sequence[Options], head: str) -> list[str]:
         # As many triples as pairs: the value of `key` follows from the other two.
         if all(values(head, other, key) > values(head, other) for other in kept):
             kept.append(key)
-    # Of each file its name says enough, unless it has changed.
+    # Of each file the name is enough, unless it has changed.
     return [*kept[1:], *([CONTENT] if values(*kept, CONTENT) > values(*kept) else [])]
 
 

@@ -33,7 +33,7 @@ HELD_OUT = ("held_out_aihtr", "held_out_accuracy", "held_out_sensors_per_step")
 """Figures of a run on recordings; its other figures are those on the validation tracks."""
 
 CONTENT = "kernel.content"
-"""Setting of a run whose world is read from files: a digest of what they held."""
+"""Setting of a run whose world is read from files: a digest of their content."""
 
 Figures = Mapping[str, float | None]
 
