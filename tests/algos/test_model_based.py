@@ -15,6 +15,7 @@ from tests.algos.estimates.test_path_counts import SWEEP
 from tests.helpers import algorithm, collect, headings, hop_world, small_world, train_config
 from tests.tracks import by_hand, recorded, write
 from tests.typed import refused
+from trackmdp.algos import model_based
 from trackmdp.algos.estimates import path_plans
 from trackmdp.algos.estimates.hidden_modes import Fit, fit_modes
 from trackmdp.algos.estimates.shrinkage import without
@@ -24,6 +25,7 @@ from trackmdp.app.cli import main
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.recordings.tracks import Recorded
+from trackmdp.seeding import derive
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
@@ -169,6 +171,17 @@ def test_its_uncertainty_shrinks_and_covers_the_truth() -> None:
     visits = [row["least_visits"] for row in rows]
     assert visits == sorted(visits)
     assert visits[0] > 0
+
+
+def test_its_uncertainty_is_not_smaller_for_few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two draws that are d apart the variance is d² / 2, without bias."""
+    monkeypatch.setattr(model_based, "_SAMPLES", 2)
+    world = small_world(3)
+    learner, rows = learn(world, 1)
+    rng = np.random.default_rng(derive(0, "model_based"))
+    kernels = learner._estimate.samples(rng, 2)
+    first, second = (evaluate(learner._world(each), learner.actor).aihtr for each in kernels)
+    assert rows[-1]["believed_deviation"] == pytest.approx(abs(first - second) / 2**0.5)
 
 
 @pytest.mark.usefixtures("little_search")

@@ -219,7 +219,7 @@ class ModelBased(Checkpointed):
         others = map(self._world, self._estimate.samples(self._rng, _SAMPLES))
         # Each begins with the mean kernel's values, which counts where the grid is too large to factorise.
         worth = [value_of(other, plan, guess=mean.value).aihtr for other in others]
-        return {"believed_aihtr": mean.aihtr, "believed_deviation": float(np.std(worth))}
+        return {"believed_aihtr": mean.aihtr, "believed_deviation": float(np.std(worth, ddof=1))}
 
     def _diagnostics(self) -> dict[str, float]:
         """Figures of the last plan, and the costs of learning so far."""
