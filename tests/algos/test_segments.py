@@ -65,6 +65,14 @@ def test_a_recording_that_stops_ends_its_segments() -> None:
     assert segments(limited) == [(0, 1, 2, 3)] * 2 + [(1, 2, 3, 4)] * 2
 
 
+def test_where_all_recordings_are_short_those_that_exit_are_no_selection() -> None:
+    """None shows three steps: the one that stops counts as if the target left there."""
+    both = by_hand([0, 1], [3, 4, 5], exits=[True, False])
+    setting, made = recorded(both, anywhere=False), buffer()
+    made.extend(collect(setting, Policy.all_on(setting), 2, 8))
+    assert {*segments(made)} == {(0, 1, 9, 9), (1, 9, 9, 9), (3, 4, 5, 9), (4, 5, 9, 9)}
+
+
 @pytest.mark.parametrize("cut", [1, 2, 5, 20])
 def test_batches_in_pieces_give_what_they_give_in_one(cut: int) -> None:
     batch = collect(SETTING, Policy.all_on(SETTING), 16, 40)

@@ -21,7 +21,8 @@ class SegmentBuffer(SensedPaths):
     """Replay buffer of path segments: a located cell and the cells sensed in the `steps` steps after it, M for outside.
 
     Unlike `MoveBuffer` it never puts a path together from moves of different ones. A segment begins at every step that
-    is followed by enough others, or by the exit; which these are does not depend on where the target went.
+    is followed by enough others, or by the exit. Where none is followed by enough, each recording counts as if the
+    target left where it stops.
 
     Args:
         task: its sensors. Where a policy remembers detections, segments are of the keys with all sensors on.
@@ -73,8 +74,8 @@ class SegmentBuffer(SensedPaths):
             gone = place + step > last
             cells.append(np.where(gone, keys.num_keys, np.roll(line, -step)))
         whole = ~gone | np.repeat(tracks.exits, lengths)
-        if not whole.any():  # all recordings stop early; they count as if the target left there
-            whole = last > place
+        if gone.all():  # all recordings stop early; those of exits alone would be a selection: all count as exits
+            whole |= last > place
         kind = cell_dtype(keys.num_keys)
         return torch.as_tensor(np.stack(cells)[:, whole]).to(self._generator.device, kind)
 
