@@ -6,6 +6,7 @@ import json
 import struct
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -133,6 +134,34 @@ def test_mlflow_in_the_folder(tmp_path: Path) -> None:
     (artifacts,) = (tmp_path / "mlflow").glob("*/artifacts")
     assert {"policy.png", "value.png", "world.png"} <= {each.name for each in artifacts.iterdir()}
     assert_same_policy(artifacts / "policy.npz", tmp_path / "policy.npz")
+
+
+def test_an_experiment_that_another_run_makes_at_once_is_shared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As runs of a sweep that begin together: between looking for it and making it, another one has made it."""
+    pytest.importorskip("mlflow")
+    from mlflow.exceptions import MlflowException
+
+    class Client:
+        def __init__(self, uri: str) -> None:
+            self.made: list[str] = []
+
+        def get_experiment_by_name(self, name: str) -> Any:
+            return SimpleNamespace(experiment_id="7") if name in self.made else None
+
+        def create_experiment(self, name: str, place: str | None) -> str:
+            self.made.append(name)
+            raise MlflowException("it exists already")
+
+        def create_run(self, number: str, run_name: str) -> Any:
+            return SimpleNamespace(info=SimpleNamespace(run_id=f"{number}-{run_name}"))
+
+    monkeypatch.setattr("mlflow.MlflowClient", Client)
+    monkeypatch.setattr("trackmdp.training.result_loggers.typed", lambda trainer: {})
+    logger = MlflowLogger(MlflowConfig(every=1, uri="http://x", experiment="mine"), tmp_path / "a")
+    logger.on_start(cast(Training, None))
+    assert logger._id == "7-a"
 
 
 def test_no_database_is_made_through_a_link(tmp_path: Path) -> None:

@@ -245,15 +245,18 @@ class MlflowLogger(_Tracker):
 
     def _begin(self, trainer: Training) -> None:
         from mlflow.entities import Param
+        from mlflow.exceptions import MlflowException
 
-        found = self._client.get_experiment_by_name(self._cfg.experiment)
         # The default place of artifacts is a folder where the command was typed.
         place = (self._folder.resolve() / "mlflow").as_uri() if self._cfg.uri is None else None
-        number = (
-            found.experiment_id
-            if found
-            else self._client.create_experiment(self._cfg.experiment, place)
-        )
+        try:
+            number = self._client.create_experiment(self._cfg.experiment, place)
+        except (
+            MlflowException
+        ):  # it is there, perhaps since another run of the sweep has made it just now
+            if not (found := self._client.get_experiment_by_name(self._cfg.experiment)):
+                raise
+            number = found.experiment_id
         run = self._client.create_run(number, run_name=self._folder.resolve().name)
         self._id = run.info.run_id
         options = [Param(*each) for each in typed(trainer).items()]
