@@ -13,6 +13,9 @@ from trackmdp.errors import UserError
 
 # Cells up to which a full matrix is factorised, in a quarter of the time: beliefs that spread leave few zeros.
 FULL = 200
+KEYED_DIRECT = 700
+"""Events of several keys or modes a cell up to which their system, or one of groups of them, is factorised as a full
+matrix: each leads to all cells in reach."""
 ENDLESS = (
     "kernel: from some cell the target never exits, so no value is finite: "
     "expected an exit reachable from each cell"

@@ -19,15 +19,11 @@ from scipy.sparse.linalg import spsolve_triangular
 from trackmdp.arrays.entries import short_indices
 from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.errors import UserError
-from trackmdp.solvers.factors import ENDLESS, FULL, factorised
+from trackmdp.solvers.factors import ENDLESS, FULL, KEYED_DIRECT, factorised
 from trackmdp.solvers.multigrid import Level
 
 DIRECT_CELLS = 20_000
 """Cells up to which systems are factorised. The factors of a grid fill about M^1.4 entries: 75 a cell at M = 16,384."""
-
-KEYED_DIRECT = 700
-"""Events of several keys or modes a cell up to which their system is factorised, as a full matrix: each leads to all
-cells in reach."""
 
 # Residual aimed at, relative to the size of right-hand side and solution: some 50 units of rounding of float64.
 TOLERANCE = 1e-14

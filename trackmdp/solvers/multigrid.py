@@ -9,7 +9,7 @@ from scipy import sparse
 
 from trackmdp.arrays.entries import short_indices, summing
 from trackmdp.arrays.types import Array, IndexArray
-from trackmdp.solvers.factors import factorised
+from trackmdp.solvers.factors import FULL, KEYED_DIRECT, factorised
 
 # Side of the square blocks that are one cell of the next coarser level, and cells at which a level is factorised.
 _BLOCK = 4
@@ -43,7 +43,7 @@ class Level:
         # constant on each block.
         coarse = short_indices(sparse.csr_array(self._sums @ system @ self._blocks))
         if coarse.shape[0] <= COARSEST or not isinstance(size, tuple):
-            solve = factorised(coarse)
+            solve = factorised(coarse, FULL if isinstance(size, tuple) else KEYED_DIRECT)
             self._corrected: Callable[[Array], Array] = lambda left: solve(left, False)
             return
         below = Level(coarse, (-(-size[0] // _BLOCK), -(-size[1] // _BLOCK)))
