@@ -36,7 +36,13 @@ def check(world: tm.World, name: str, **options: Any) -> None:
         assert run.evaluation.aihtr == expected.evaluation.aihtr * unit
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
+SLOW = ("ppo", "a2c_per_sensor", "ppo_per_sensor", "dqn_per_sensor")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in ALGORITHMS],
+)
 def test_of_moves(name: str) -> None:
     check(small_world(), name, **OPTIONS.get(name, CREDIT))
 

@@ -64,7 +64,9 @@ def test_no_policy_with_a_budget_is_above_the_dual_over_prices(seed: int) -> Non
         assert best <= dual.worth(1.0, price) + 1e-9
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 6))]
+)
 def test_corners_of_a_frontier_with_a_budget_are_optima_of_their_prices(seed: int) -> None:
     world = tiny(seed, 1)
     edge, free = frontier(world), frontier(world.but(budget=None))
