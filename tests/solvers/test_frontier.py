@@ -18,6 +18,7 @@ from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.frontier import FrontierProgress, _Trace, frontier
+from trackmdp.solvers.solve import run_solver
 from trackmdp.solvers.tradeoff import Tradeoff
 from trackmdp.world.model import World
 
@@ -250,6 +251,25 @@ def test_ctrl_c_leaves_the_corners_found_so_far() -> None:
     assert seen[-1].corners == len(made.corners)
     assert made.gap >= seen[-1].left > made.resolution
     assert made.at(sensors=0.5).sensors == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("prices", [1, 2])
+def test_ctrl_c_before_the_highest_price_certifies_nothing(
+    prices: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is known of fewer sensors than those of the only corner."""
+
+    def run(*args: Any, **kwargs: Any) -> Any:
+        if next(solved) == prices:
+            raise KeyboardInterrupt
+        return run_solver(*args, **kwargs)
+
+    solved = itertools.count()
+    monkeypatch.setattr("trackmdp.solvers.frontier.run_solver", run)
+    made = frontier(small(None))
+    assert made.interrupted
+    assert made.corners[0].sensors > 0
+    assert not made.certified
 
 
 def test_ctrl_c_at_any_line_keeps_each_price_with_its_bound() -> None:

@@ -150,8 +150,12 @@ class Tradeoff(Carded):
 
     @property
     def certified(self) -> bool:
-        """Whether every corner is certified, and no edge is farther than `resolution` below the frontier."""
-        return self.gap <= self.resolution and all(corner.certified for corner in self.corners)
+        """Whether every corner is certified, and no edge is farther than `resolution` below the frontier.
+
+        Not where it begins above 0 sensors, as after an interruption: nothing is known of fewer than there.
+        """
+        whole = self.corners[0].sensors == 0 and self.gap <= self.resolution
+        return whole and all(corner.certified for corner in self.corners)
 
     def at(self, *, accuracy: float | None = None, sensors: float | None = None) -> Mixture:
         """The mixture of exactly this accuracy, or of exactly so many sensors per step.
