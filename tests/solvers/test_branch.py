@@ -107,6 +107,11 @@ def test_the_bound_holds_where_ctrl_c_comes_amid_an_expansion(
         _to_the_end(tree)
     assert not tree.closed
     assert (tree.upper() >= best - 1e-9).all()
+    # Run again, it goes on from there.
+    monkeypatch.undo()
+    _to_the_end(tree)
+    assert tree.closed
+    assert tree.best == pytest.approx(best, abs=1e-7)
 
 
 @pytest.mark.parametrize(

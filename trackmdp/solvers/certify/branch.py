@@ -150,7 +150,13 @@ class Tree:
         return before[choices.state] + (choices.left * on_left[choices.state]).sum(axis=1)
 
     def run(self, go_on: Callable[[Tree], bool]) -> None:
-        """Expand open choices, best first, while there are any and `go_on(self)` holds."""
+        """Expand open choices, best first, while there are any and `go_on(self)` holds.
+
+        After an interruption it can go on: what was in hand is opened again, and what followed from it stays open.
+        """
+        for choices in self._in_hand:
+            self._push(choices)
+        self._in_hand = []
         while not self.closed and go_on(self):
             if self._heap:
                 self._in_hand = [self._heap[0][2]]
