@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -13,7 +15,7 @@ from trackmdp.solvers import bounds, exchange, hidden, optimal, search
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found
-from trackmdp.solvers.solution import SearchProgress
+from trackmdp.solvers.solution import SearchProgress, Solution
 from trackmdp.solvers.solve import solve
 from trackmdp.world.make import make_world
 from trackmdp.world.model import World
@@ -194,6 +196,19 @@ def test_a_search_can_be_watched_limited_and_interrupted() -> None:
     late = solve(world, time_limit=1e-9)
     assert (late.timed_out, late.interrupted, late.certified) == (True, False, False)
     assert late.lower <= stopped.lower < late.upper
+
+
+@pytest.mark.usefixtures("little_search")
+def test_a_time_limit_that_ends_the_proof_alone_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its bound depends on the machine, also where the search was done in time."""
+    prove = optimal.solve
+
+    def late(world: World, **given: object) -> Solution:
+        return replace(prove(world, **given), timed_out=True)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(optimal, "solve", late)
+    found = solve(headings(3, 0.7, memory="displacement"))
+    assert (found.timed_out, found.certified) == (True, False)
 
 
 def test_where_a_search_takes_long_some_are_annealed_in_place_of_homotopies(

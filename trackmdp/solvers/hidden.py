@@ -111,7 +111,7 @@ def solve(
         interrupted = True
     seconds = time.monotonic() - began
     found = bracketed(world, search.best.table, seconds, best.bound, tolerance)
-    late = budget.timed_out and not found.certified
+    late = (budget.timed_out or best.timed_out) and not found.certified
     return replace(found, nodes=best.nodes, interrupted=interrupted, timed_out=late)
 
 
