@@ -370,6 +370,18 @@ def test_a_script_that_workers_run_anew_ends_in_one_line(tmp_path: Path) -> None
     )
 
 
+def test_ctrl_c_in_one_block_ends_the_solve(monkeypatch: pytest.MonkeyPatch) -> None:
+    def search(_: object) -> None:
+        searched.append(1)
+        raise KeyboardInterrupt
+
+    searched = list[int]()
+    monkeypatch.setattr("trackmdp.solvers.optimal._Run.search", search)
+    with pytest.raises(KeyboardInterrupt):
+        tm.solve(tm.make_world("random_walk", size=10, cost=0.4), block=5)
+    assert len(searched) == 1
+
+
 def test_a_policy_of_another_grid_cannot_be_put_together() -> None:
     def whole(number: int, world: World) -> tm.Policy:
         return tm.Policy.all_on(tm.make_world(size=8))
