@@ -26,6 +26,7 @@ BEFORE_ALL = (
     "statistics",
     "machine",
     "signals",
+    "terminal",
     "cluster",
 )
 

@@ -14,7 +14,9 @@ from typing import Any, Self
 
 from trackmdp.errors import Preempted
 
-HEARD = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
+ENDING = (signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
+"""Signals of a scheduler, and of a terminal that is gone, which by themselves would end one process at once."""
+HEARD = (*ENDING, signal.SIGINT)
 """Signals that ask a run to stop."""
 _ONE = 2.0
 """Seconds in which two count as one: `timeout` and some schedulers signal the process, and then its group once more."""
@@ -26,12 +28,14 @@ _AGAIN = 20.0
 def handled(handler: Any, *numbers: signal.Signals) -> Iterator[None]:
     """Handle signals by `handler` inside; afterwards by the handlers from before, also if the body installs others.
 
-    Outside the main thread nothing is changed.
+    Outside the main thread nothing is changed. Where SIGHUP is ignored, as behind `nohup`, it stays so.
     """
     # Python allows signal.signal in the main thread alone; `train` called from another one runs without.
     main = threading.current_thread() is threading.main_thread()
     # All are known before the first is changed: from then on the handler may be called, and raise.
     before = {number: signal.getsignal(number) for number in numbers if main}
+    if before.get(signal.SIGHUP) is signal.SIG_IGN:
+        del before[signal.SIGHUP]
     try:
         for number in before:
             signal.signal(number, handler)
@@ -74,7 +78,7 @@ def kept(number: signal.Signals) -> Iterator[None]:
 
 
 class Signals(ExitStack):
-    """While entered, SIGTERM, SIGINT and SIGUSR1 are noted in `received` instead of ending the process.
+    """While entered, the signals of `HEARD` are noted in `received` instead of ending the process.
 
     A second signal of the same kind has its former effect: Ctrl-C immediately, the others if they come at least two
     seconds after the first. Outside the main thread no handler is installed.

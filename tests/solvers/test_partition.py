@@ -21,7 +21,7 @@ from tests.typed import ENVIRONMENT, typed
 from trackmdp.app.cli import main
 from trackmdp.config.compose import compose
 from trackmdp.errors import Preempted, UserError
-from trackmdp.signals import Signals, handled, stop
+from trackmdp.signals import ENDING, Signals, handled, stop
 from trackmdp.solvers import optimal, regions, workers
 from trackmdp.solvers.partition import Block, blocks, default_halo, plan_by_blocks, reach, sub_world
 from trackmdp.solvers.regions import region_side
@@ -291,7 +291,7 @@ def test_a_signal_ends_all_workers_and_none_begins_another_job(
     assert left in ({"0 begun", "0 saved"}, {"0 begun", "0 saved", "1 begun", "1 saved"})
 
 
-@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGUSR1, signal.SIGTERM])
+@pytest.mark.parametrize("kind", [signal.SIGINT, *ENDING])
 def test_what_comes_while_workers_start_is_heard_afterwards(kind: signal.Signals) -> None:
     reached = []
     with handled(stop, kind), pytest.raises(Preempted) as told, workers.starting():
@@ -300,7 +300,7 @@ def test_what_comes_while_workers_start_is_heard_afterwards(kind: signal.Signals
         reached.append(blocked)
     assert told.value.signal == kind
     assert reached == [
-        {signal.SIGINT, signal.SIGUSR1}
+        {signal.SIGINT, signal.SIGUSR1, signal.SIGHUP}
     ]  # which a worker inherits; by SIGTERM it is ended
     assert not signal.pthread_sigmask(signal.SIG_BLOCK, [])
 

@@ -131,7 +131,13 @@ def test_a_loss_that_is_not_finite_names_the_iteration_and_leaves_the_last_good_
 
 @pytest.mark.parametrize(
     ("number", "iteration"),
-    [(signal.SIGTERM, 3), (signal.SIGINT, 3), (signal.SIGUSR1, 3), (signal.SIGTERM, 8)],
+    [
+        (signal.SIGTERM, 3),
+        (signal.SIGINT, 3),
+        (signal.SIGUSR1, 3),
+        (signal.SIGHUP, 3),
+        (signal.SIGTERM, 8),
+    ],
 )
 def test_a_signal_ends_the_run_after_its_iteration_is_saved(
     number: signal.Signals,

@@ -86,7 +86,7 @@ def test_outside_the_main_thread_signals_are_not_touched() -> None:
     assert seen == [before]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP])
 @pytest.mark.parametrize(
     ("place", "words"),
     [

@@ -16,6 +16,7 @@ from pathlib import Path
 from trackmdp import __version__
 from trackmdp.errors import FAILED, INTERRUPTED, USER_MISTAKE, Preempted, RunError, UserError
 from trackmdp.imports import importing, leave_current_folder
+from trackmdp.terminal import outlast_terminal
 from trackmdp.untrusted import printable
 
 COMMANDS = {
@@ -54,6 +55,7 @@ def main(argv: list[str] | None = None) -> int:
     # Every process that the command starts inherits it; see `trackmdp.imports.safe_children`.
     os.environ.setdefault("PYTHONSAFEPATH", "1")
     if argv is None:
+        outlast_terminal()
         leave_current_folder()
     try:
         status = _dispatch(words)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import io
 import shlex
-import signal
 import sys
 from collections.abc import Generator, Sequence
 from contextlib import closing, nullcontext, redirect_stdout
@@ -39,7 +38,7 @@ from trackmdp.config.checks import build_config, validate
 from trackmdp.config.registry import maker
 from trackmdp.config.resume import key_of
 from trackmdp.errors import UserError, message_of
-from trackmdp.signals import handled, leave
+from trackmdp.signals import ENDING, handled, leave
 
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 _OF_SWEEPS = ("hydra.sweep", "hydra.launcher")
@@ -64,7 +63,7 @@ def launch(command: str, words: Sequence[str]) -> int:
         if answer(compose, args):
             return 0
         many = args.multirun or "hydra.mode=MULTIRUN" in args.overrides
-        with handled(leave, signal.SIGTERM, signal.SIGUSR1):
+        with handled(leave, *ENDING):
             return _sweep(compose) if many else _run_once(compose)
 
 

@@ -137,14 +137,14 @@ def _pool(workers: int) -> ProcessPoolExecutor:
 
 @contextmanager
 def starting(*more: signal.Signals) -> Iterator[None]:
-    """Block SIGINT and SIGUSR1 while workers start; they, and Python's tracker of semaphores, inherit the mask.
+    """Block SIGINT, SIGUSR1 and SIGHUP while workers start; they, and Python's tracker of semaphores, inherit the mask.
 
     This process notes the signals, ends the workers with SIGTERM, and raises the signals again at the end.
 
     Args:
         more: signals to be blocked as well.
     """
-    later = {signal.SIGINT, signal.SIGUSR1, *more}
+    later = {signal.SIGINT, signal.SIGUSR1, signal.SIGHUP, *more}
     heard: list[int] = []
     # A process that gets a signal while it still imports would write a traceback, so would a worker left half started.
     # The handler notes the signal all the same, since another thread may receive it.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -17,7 +16,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from trackmdp.notebook.card import counted_words, decimal
-from trackmdp.signals import handled, stop
+from trackmdp.signals import ENDING, handled, stop
 from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.untrusted import printable
 
@@ -149,7 +148,7 @@ def reporting(console: Console, title: str) -> Iterator[Callable[[object], None]
         title: before each line, which is the text of a progress.
     """
     last = time.monotonic()
-    ended = handled(stop, signal.SIGTERM, signal.SIGUSR1)
+    ended = handled(stop, *ENDING)
     with ended, console.status(title) as status:
 
         def show(progress: object) -> None:

@@ -25,6 +25,7 @@ from trackmdp.config import TrainConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import FAILED, USER_MISTAKE, Preempted, RunError, UserError
 from trackmdp.solvers.workers import end_with_parent, starting
+from trackmdp.terminal import outlast_terminal
 from trackmdp.training.folders import DONE, FAILED_FILE, SUMMARY, run_of
 from trackmdp.untrusted import reason
 
@@ -135,6 +136,7 @@ def _run_in_child(job: Job, folder: Path, connection: Connection) -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _TERMINATING)
     # The fork server stays in the folder in which it was started, so that relative paths would be meant from there.
     os.chdir(folder)
+    outlast_terminal()
     # At the level of the descriptor, so that output of libraries in C goes to the file as well. Errors stay on the
     # terminal.
     if job.concurrent:
