@@ -32,6 +32,7 @@ PROBLEMS: dict[str, Any] = {
     "limited": limited(WORLD, 6),
     "window": World(np.full((20, 20), 0.04), (4, 5), cost=0.1, t_max=1, window=1),
     "tracks": recorded(by_hand([0, 1, 2], [3, 4, 5, 8], exits=True)),
+    "budget": World(np.full((9, 9), 0.1), 3, cost=0.1, t_max=1, budget=2),
     "group": Group([WORLD] * 2),
 }
 
@@ -97,6 +98,27 @@ def test_actions_other_than_0_and_1_are_refused(wrong: float) -> None:
             env.step(np.full(shape, wrong))
         with pytest.raises(UserError, match="action: expected 0 or 1 for each sensor"):
             env.step(np.ones((*shape[:-1], 8)))
+
+
+@pytest.mark.parametrize("how", ["own", "sync", "one"])
+def test_sampled_actions_keep_to_the_budget(how: str) -> None:
+    """Of 9 sensors 2 at most; all sets of 0, 1 and 2 are drawn, 1 + 9 + 36."""
+    world = PROBLEMS["budget"]
+    if how == "one":
+        env = gymnasium.make(ID, world=world)
+    else:
+        mode = "vector_entry_point" if how == "own" else "sync"
+        env = gymnasium.make_vec(ID, 3, world=world, vectorization_mode=mode)
+    space = env.action_space
+    space.seed(0)
+    env.reset(seed=0)
+    drawn = [space.sample() for _ in range(1000)]
+    assert all(space.contains(each) for each in drawn)
+    assert not space.contains(np.ones_like(drawn[0]))
+    assert len(np.unique(np.concatenate(drawn).reshape(-1, 9), axis=0)) == 46
+    for each in drawn[:50]:
+        if np.all(env.step(each)[2]):
+            env.reset()
 
 
 def test_a_step_by_hand() -> None:

@@ -18,6 +18,7 @@ from torchrl.data import Binary
 
 from trackmdp.config.options import GROUPS, options
 from trackmdp.environment.env import TrackEnv
+from trackmdp.environment.gym_space import AtMost
 from trackmdp.errors import UserError
 from trackmdp.world.group import Group
 from trackmdp.world.make import make_world
@@ -52,7 +53,9 @@ class _Tracked:
         self.render_mode = render_mode
         self._env = TrackEnv(self.world, shape)
         seen = {key: _space(spec, len(shape)) for key, spec in self._env.observation_spec.items()}
-        return spaces.Dict(seen), spaces.MultiBinary(self._env.num_sensors)
+        count, budget = self._env.num_sensors, getattr(self._env.action_spec, "budget", None)
+        sets = spaces.MultiBinary(count) if budget is None else AtMost(count, budget)
+        return spaces.Dict(seen), sets
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -99,7 +102,8 @@ class TrackGym(_Tracked, gymnasium.Env[Observation, npt.NDArray[np.int8]]):
     """One target (paper, Section II); `info["target"]` is its true cell, M once it has exited; of a group `[K]`.
 
     An observation has the keys of `TrackEnv`, `action_history` as a `Box` of 0 and 1; an action is a `MultiBinary(K)`:
-    the sensors to switch on. Stable-Baselines3 reads it with its `MultiInputPolicy`, TorchRL with `GymEnv`.
+    the sensors to switch on; those that `action_space` draws keep to the budget. Stable-Baselines3 reads it with its
+    `MultiInputPolicy`, TorchRL with `GymEnv`.
 
     Args:
         world: the world, recorded tracks or a group of targets; None to make one of `options`.
