@@ -253,6 +253,14 @@ def test_ctrl_c_leaves_the_corners_found_so_far() -> None:
     assert made.at(sensors=0.5).sensors == pytest.approx(0.5)
 
 
+def test_prices_far_apart_are_raised_as_far_as_prices_go() -> None:
+    """Two sensors stay on at the highest price of the third: what is left out is not certified."""
+    world = World(np.full((3, 3), 0.3), (1, 3), cost=[1e9, 0.1, 0.1], t_max=0)
+    made = frontier(world)
+    assert made.corners[0].sensors > 0
+    assert not made.certified
+
+
 @pytest.mark.parametrize("prices", [1, 2])
 def test_ctrl_c_before_the_highest_price_certifies_nothing(
     prices: int, monkeypatch: pytest.MonkeyPatch

@@ -189,7 +189,9 @@ class _Trace:
         self.solve(0.0)
         self.solve(_LEAST * self.world.reward)
         price = self.world.reward + self.world.safe_cost
-        while self.solve(min(price, LARGEST_PRICE)).sensors > 0 and price < LARGEST_PRICE:
+        # The dearest sensor has a price as well, also after rounding.
+        most = 0.9 * LARGEST_PRICE / float(np.nanmax(self.weights))
+        while self.solve(min(price, most)).sensors > 0 and price < most:
             price *= _FACTOR
 
     def refine(self) -> None:
