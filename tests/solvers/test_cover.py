@@ -262,6 +262,15 @@ def test_sets_ahead_are_the_best_plans_of_small_worlds(seed: int, budget: int | 
         assert worth == pytest.approx(most, abs=1e-9)
 
 
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_the_unit_of_rewards_and_prices_changes_no_proof(seed: int) -> None:
+    world, unit = footprint_world(seed), 1e-12
+    small = world.but(reward=unit, cost=unit * world.cost, safe_cost=unit * world.safe_cost)
+    best = optimal.solve(small)
+    assert best.certified
+    assert best.lower == pytest.approx(unit * optimal.solve(world).lower, rel=1e-6)
+
+
 def test_footprints_of_one_cell_in_another_order_are_the_papers_sensors() -> None:
     rng = np.random.default_rng(5)
     world = World(random_kernel(rng, 9, 0.1), 3, cost=0.2 * rng.random(9), t_max=1, safe_cost=2.0)

@@ -376,7 +376,7 @@ class Shared:
         left = upper - self.worth(sets, column, paid)[:, 0]
         kept = self.distinct(price)
         if self.perfect:
-            unproved = left > PROVED * np.maximum(upper, 1e-3)
+            unproved = left > PROVED * np.maximum(upper, 1e-3 * np.abs(gain).max(initial=0.0))
             few = self._few(kept[unproved[self.rows[kept]]]) & unproved
             listed, most = self._of_all(kept[few[self.rows[kept]]], gain, price)
             other[few[self.rows], 0] = listed[few[self.rows]]
