@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from trackmdp.durable import write_text
+from trackmdp.durable import whole_file, write_text
 from trackmdp.episodes.episode_page import page
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.schema import schemas_of
@@ -49,8 +50,8 @@ def write_tables(reader: EpisodeReader, folder: Path, number: int | None = None)
 
 
 def _write(file: Path, columns: list[str], rows: Iterable[dict[str, Any]]) -> None:
-    with file.open("w", newline="", encoding="utf-8") as stream:
-        table = csv.DictWriter(stream, columns, extrasaction="ignore")
+    with whole_file(file) as stream:
+        table = csv.DictWriter(codecs.getwriter("utf-8")(stream), columns, extrasaction="ignore")
         table.writeheader()
         for row in rows:
             listed = {

@@ -9,6 +9,7 @@ import pty
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -194,6 +195,24 @@ def test_tables_hold_every_step(log: Path, tmp_path: Path) -> None:
             " ".join(map(str, np.flatnonzero(action))) for action in episode.action
         ]
     assert (tmp_path / "a.html").stat().st_size > 10_000
+
+
+def test_tables_that_are_interrupted_leave_those_from_before(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ["replay", f"file={log}", f"csv={tmp_path}/t", "quiet=true"]
+    assert main(words) == 0
+    before = {file: file.read_bytes() for file in (tmp_path / "t").iterdir()}
+    read = EpisodeReader.read
+
+    def interrupted(self: EpisodeReader, number: int) -> Any:
+        if number == 5:
+            raise KeyboardInterrupt
+        return read(self, number)
+
+    monkeypatch.setattr(EpisodeReader, "read", interrupted)
+    assert main(words) == 130
+    assert {file: file.read_bytes() for file in (tmp_path / "t").iterdir()} == before
 
 
 @pytest.mark.parametrize(
