@@ -129,3 +129,9 @@ def test_a_state_that_is_none_is_refused(acting: Policy, key: str, value: int) -
     rows[key][1] = value
     with pytest.raises(UserError, match=f"{key}={value}"):
         acting(TensorDict(rows, [2]))
+
+
+@pytest.mark.parametrize("k", [1.5, "2", True, -1, M + 1])
+def test_a_number_of_sensors_that_is_none_is_refused(k: Any) -> None:
+    with pytest.raises(UserError, match=f"^policy: k={k!r}: expected an integer from 0 to {M}"):
+        Policy.random_k(WORLD, k)

@@ -21,6 +21,7 @@ from torchrl.envs.transforms import Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from trackmdp.arrays.entries import with_data
+from trackmdp.arrays.numbers import whole_number
 from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError, output_of, path_of
 from trackmdp.policies.forms import (
@@ -100,7 +101,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
 
         Where fewer than k can be chosen, as in a window at the border, all of them are on.
         """
-        near = PolicyTable.all_on(task).sets
+        k, near = whole_number("policy: k", k, 0, task.total_sensors), PolicyTable.all_on(task).sets
         count = np.diff(near.indptr)
         # Each sensor's own probability of being among the k of its window.
         share = np.minimum(k / np.repeat(count, count), 1.0)

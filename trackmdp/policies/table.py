@@ -14,6 +14,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.arrays.entries import ones_at, short_indices
+from trackmdp.arrays.numbers import whole_number
 from trackmdp.arrays.types import AnyArray, Array, BoolArray
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, decimal, grid_words
@@ -145,8 +146,8 @@ class PolicyTable(Carded, SetTable):
             raise UserError("policy: expected either sets or one probability for all sensors")
         if probability is not None and not 0.0 <= probability <= 1.0:
             raise UserError(f"policy: expected a probability between 0 and 1, got {probability}")
-        if k is not None and not 0 <= k <= task.total_sensors:
-            raise UserError(f"policy: expected k from 0 to {task.total_sensors} sensors, got {k}")
+        if k is not None:
+            k = whole_number("policy: k", k, 0, task.total_sensors)
         sets = _choosable_sets(task, probability) if sets is None else sets
         super().__init__(task.task, _checked(task, sets), task.num_keys, k=k)
 
@@ -227,7 +228,7 @@ class PolicyTable(Carded, SetTable):
         if task.budget is not None and (most := self.most_on) > task.budget:
             raise UserError(f"policy: up to {most} sensors on in a step; expected {task.budget}")
 
-    @property
+    @cached_property
     def most_on(self) -> int:
         """Sensors that may be on in one step."""
         return int(np.diff(self.sets.indptr).max(initial=0)) if self.k is None else self.k
