@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -90,3 +92,24 @@ def test_a_state_of_another_memory_is_refused() -> None:
         UserError, match=r"^state: made for .*displacement_gap.*, expected .*'cell'"
     ):
         tm.Tracker.restore(some(WORLD), state)
+
+
+def test_sets_beyond_the_budget_are_neither_followed_nor_handed_on(tmp_path: Path) -> None:
+    """All 9 sensors on where 2 may be; a tracker of the file is refused as well, and nothing is written."""
+    policy = Policy.all_on(small_world().but(budget=2))
+    policy.save(tmp_path / "policy.npz")
+    calls: list[Callable[[], Any]] = [
+        lambda: policy.tracker(4),
+        lambda: tm.Tracker(tmp_path / "policy.npz", 4),
+        lambda: tm.Tracker.restore(policy, begun().state()),
+        lambda: tm.export(policy, tmp_path / "sets.json"),
+    ]
+    for call in calls:
+        with pytest.raises(UserError, match=r"^policy: up to 9 sensors on in a step; expected 2$"):
+            call()
+    assert [each.name for each in tmp_path.iterdir()] == ["policy.npz"]
+
+
+def test_the_motion_of_a_group_is_refused() -> None:
+    with pytest.raises(UserError, match=r"^tracker: world: expected a World of 3 x 3 cells"):
+        begun(world=tm.Group([small_world()] * 2))

@@ -47,7 +47,7 @@ def export(policy: Any, file: str | Path, *, value: Array | None = None, label: 
 
     Raises:
         UserError: the file cannot be written there, its ending is unknown, a package is missing, the policy draws its
-            sets or is too large.
+            sets, is too large or exceeds the budget.
     """
     place, table = output_of(file, "export"), adapted(None, policy)
     if not isinstance(table, PolicyTable):
@@ -55,6 +55,7 @@ def export(policy: Any, file: str | Path, *, value: Array | None = None, label: 
         raise UserError(
             f"export: a {held}, expected a policy of one target: a Policy, a Run or a Solution"
         )
+    table.check_fits(table.task)
     if value is None:
         value = getattr(getattr(policy, "evaluation", None), "value", None)
     if place.suffix not in WRITERS:

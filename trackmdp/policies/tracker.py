@@ -49,7 +49,8 @@ class Tracker(Following):
 
     Raises:
         UserError: the cell or position is outside the grid; the mode is missing, or given where detections do not
-            reveal it; the file holds no policy; or the world is of another grid or other sensors.
+            reveal it; the file holds no policy; the policy exceeds its budget; or the world is of another grid or other
+            sensors.
 
     Example:
         >>> from trackmdp import Policy, make_world
@@ -231,17 +232,19 @@ def _plan(policy: Plan | str | Path) -> Plan:
     """The policy, which may be in a file.
 
     Raises:
-        UserError: it is no policy of one target, or the file holds none.
+        UserError: it is no policy of one target, the file holds none, or it exceeds the budget.
     """
     if not isinstance(policy, str | Path):
         if not hasattr(policy, "sensors"):
             raise UserError(
                 f"tracker: a {type(policy).__name__}, expected a policy of one target, or its file"
             )
+        if isinstance(policy, PolicyTable):
+            policy.check_fits(policy.task)
         return policy
     if (kind := Path(policy).suffix) not in (".npz", ".onnx"):
         raise UserError(f"tracker: {policy}: expected a policy.npz or a policy.onnx")
-    return OnnxTable(policy) if kind == ".onnx" else load_policy(Path(policy))[0]
+    return OnnxTable(policy) if kind == ".onnx" else _plan(load_policy(Path(policy))[0])
 
 
 def _check_world(world: Any, task: Task) -> None:
@@ -251,8 +254,7 @@ def _check_world(world: Any, task: Task) -> None:
         UserError: it has none, or is not.
     """
     expected = task.size, task.total_sensors
-    if world is not None and (
-        not hasattr(world, "kernel") or (world.size, world.total_sensors) != expected
-    ):
+    found = tuple(getattr(world, name, None) for name in ("size", "total_sensors"))
+    if world is not None and (not hasattr(world, "kernel") or found != expected):
         grid = f"{task.rows} x {task.columns} cells"
         raise UserError(f"tracker: world: expected a World of {grid} and {expected[1]} sensors")
