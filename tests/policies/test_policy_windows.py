@@ -10,10 +10,12 @@ from tensordict.nn import TensorDictModule
 
 from tests.helpers import random_kernel
 from tests.policies.test_policy import M, stochastic
+from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
 from trackmdp.policies import lookup
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.sensing.task import Task
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import World
 
 
@@ -135,3 +137,25 @@ def test_every_sensor_of_a_window_is_on_however_it_is_looked_up(t_max: int) -> N
         everything(state.clone())["action"], Policy(world, everything.sets)(state.clone())["action"]
     )
     assert (everything.sets.dtype, everything.sets.indices.dtype) == (np.bool_, np.int32)
+
+
+@pytest.mark.parametrize("footprints", [False, True])
+@pytest.mark.parametrize("kind", ["all on", "table", "wider", "keys"])
+def test_a_policy_of_a_wider_choice_is_refused_in_a_window(kind: str, footprints: bool) -> None:
+    """A row of 5 cells: with a window of 1 sensor 2 cannot be chosen from cell 0; with a pair of cells each, sensor 2
+    sees cells 2 and 3."""
+    more = {"coverage": np.eye(5) + np.eye(5, k=1)} if footprints else {}
+    world = World(np.full((5, 5), 0.18), (1, 5), cost=0.1, t_max=0, window=1, **more)
+    wide = world.but(
+        window=2 if kind == "wider" else None, memory="displacement" if kind == "keys" else "cell"
+    )
+    policy = Policy.all_on(wide)
+    if kind in ("table", "keys"):
+        policy = Policy(wide, policy.written)
+    for call in (evaluate, lambda *given: simulate(*given, 1)):
+        with pytest.raises(
+            UserError, match=r"^policy: sensor 2 cannot be chosen from cell 0, with grid\.window=1$"
+        ):
+            call(world, policy)
+    near = Policy.from_dense(wide, Policy.all_on(world.but(memory=wide.memory)).dense())
+    assert evaluate(world, near).aihtr == pytest.approx(evaluate(world, "all_on").aihtr)

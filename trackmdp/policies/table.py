@@ -17,6 +17,7 @@ from trackmdp.arrays.entries import ones_at, short_indices
 from trackmdp.arrays.numbers import whole_number
 from trackmdp.arrays.types import AnyArray, Array, BoolArray
 from trackmdp.errors import UserError
+from trackmdp.memory.keys import KeySpace
 from trackmdp.notebook.card import Card, Carded, decimal, grid_words
 from trackmdp.sensing.coverage import reported
 from trackmdp.sensing.task import Task, window_cells
@@ -207,7 +208,7 @@ class PolicyTable(Carded, SetTable):
         return cls(task, short_indices(table))
 
     def check_fits(self, task: Task) -> None:
-        """Refuse a task of another grid, of other footprints, of another t_max, or of sensors that may not be on.
+        """Refuse a task of another grid, of other footprints or t_max, or in which sensors that may be on may not be.
 
         Raises:
             UserError: it is.
@@ -227,6 +228,18 @@ class PolicyTable(Carded, SetTable):
             raise UserError(f"policy: sensor {on[0]} may be on; the world has none there")
         if task.budget is not None and (most := self.most_on) > task.budget:
             raise UserError(f"policy: up to {most} sensors on in a step; expected {task.budget}")
+        if (far := task.window) is not None and (
+            self.task.window is None or self.task.window > far
+        ):
+            self._check_near(task)
+
+    def _check_near(self, task: Task) -> None:
+        """Refuse a task in whose window a sensor that may be on cannot be chosen."""
+        if not self.alike:
+            _check_choosable(task, self.task.keys, self.sets)
+        elif self.sets.nnz:
+            for cell in range(task.num_cells):  # the one row written out for all might not fit
+                _check_from(task, np.full(self.sets.nnz, cell), self.sets.indices)
 
     @cached_property
     def most_on(self) -> int:
@@ -312,25 +325,29 @@ def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
     sets.eliminate_zeros()
     if sets.shape != expected and task.window is not None and sets.nnz:
         sets = sets[np.zeros(expected[0], dtype=np.int64)]  # each cell has a window of its own
-    _check_choosable(task, sets)
+    _check_choosable(task, task.keys, sets)
     return sets
 
 
-def _check_choosable(task: Task, sets: sparse.csr_array) -> None:
-    """Refuse sets with sensors that cannot be chosen."""
+def _check_choosable(task: Task, keys: KeySpace, sets: sparse.csr_array) -> None:
+    """Refuse sets, a row for each of `keys` and number of misses, with sensors that cannot be chosen."""
     if task.window is None and task.available.all():
         return
     for begin in range(0, sets.nnz, _AT_ONCE):
         places = np.arange(begin, min(begin + _AT_ONCE, sets.nnz))
         # An entry's row is the last one that begins at or before it: indptr = (0, 2, 2, 5), place 2 is in row 2.
         row = np.searchsorted(sets.indptr, places, side="right") - 1
-        start, sensors = task.keys.cell(row // task.num_choices), sets.indices[places]
-        possible = task.choosable(start, sensors)
-        if possible is not None and not possible.all():
-            x, sensor = int(start[~possible][0]), int(sensors[~possible][0])
-            missing = not task.available[sensor]
-            why = "for there is none" if missing else f"with grid.window={task.window}"
-            raise UserError(f"policy: sensor {sensor} cannot be chosen from cell {x}, {why}")
+        _check_from(task, keys.cell(row // task.num_choices), sets.indices[places])
+
+
+def _check_from(task: Task, start: AnyArray, sensors: AnyArray) -> None:
+    """Refuse `sensors` `[E]` of which one cannot be chosen from its located cell in `start` `[E]`."""
+    possible = task.choosable(start, sensors)
+    if possible is not None and not possible.all():
+        x, sensor = int(start[~possible][0]), int(sensors[~possible][0])
+        missing = not task.available[sensor]
+        why = "for there is none" if missing else f"with grid.window={task.window}"
+        raise UserError(f"policy: sensor {sensor} cannot be chosen from cell {x}, {why}")
 
 
 def _choosable_sets(task: Task, probability: float | None) -> sparse.csr_array:
