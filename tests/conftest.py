@@ -19,8 +19,10 @@ from hypothesis import settings
 from trackmdp.solvers import hidden
 
 torch.set_num_threads(1)
-# A shell's job in the background ignores Ctrl-C, and so would all programs that a test starts from it.
+# A shell's job in the background ignores Ctrl-C, one behind `nohup` hangups, and so would all programs that a test
+# starts from it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=30)
 settings.load_profile("repeatable")
 

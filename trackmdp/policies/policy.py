@@ -101,7 +101,8 @@ class Policy(TensorDictModuleBase, PolicyTable):
 
         Where fewer than k can be chosen, as in a window at the border, all of them are on.
         """
-        k, near = whole_number("policy: k", k, 0, task.total_sensors), PolicyTable.all_on(task).sets
+        near = PolicyTable.all_on(task).sets
+        k = whole_number("policy: k", k, 0, task.total_sensors)
         count = np.diff(near.indptr)
         # Each sensor's own probability of being among the k of its window.
         share = np.minimum(k / np.repeat(count, count), 1.0)
