@@ -50,8 +50,13 @@ class _AtMost(Binary):
 
 
 @cache
-def at_most(budget: int, sensors: int) -> type[Binary]:
-    """The class of specs of sets of at most `budget` of so many sensors; made with a `shape`, as a `Binary` is."""
+def at_most(budget: int | None, sensors: int) -> type[Binary]:
+    """The class of specs of sets of at most `budget` of so many sensors; made with a `shape`, as a `Binary` is.
+
+    That is `Binary` itself where all may be on.
+    """
+    if budget is None or budget >= sensors:
+        return Binary
     members = {"budget": budget, "sensors": sensors, "__module__": __name__}
     return type(f"AtMost{budget}", (_AtMost,), members)
 

@@ -183,9 +183,7 @@ class TrackEnv(EnvBase):
             for name, each in state.items()
         }
         self.observation_spec = Composite(observed, shape=b)
-        free = task.budget is None or task.budget >= self.num_sensors
-        kind = Binary if free else at_most(task.budget, self.num_sensors)
-        self.action_spec = bits(self.num_sensors, kind=kind)
+        self.action_spec = bits(self.num_sensors, kind=at_most(task.budget, self.num_sensors))
         self.reward_spec = Unbounded((*b, 1), device=self.device)
         self.done_spec = Composite({name: bits(1) for name in FLAGS}, shape=b)
         self._observed = tuple(observed)

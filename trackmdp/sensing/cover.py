@@ -301,12 +301,9 @@ class Shared:
         if len(use):
             if not self.perfect:
                 most -= self.some(use)._unreported(np.ones((len(use), 1), dtype=bool))[entries, 0]
-            limited, spare = (
-                self._sums[: 0 if self.budget is None else None, use],
-                np.zeros(self.count),
-            )
+            limited = self._sums[: 0 if self.budget is None else None, use]
             on[use], worth, mu = relaxed(sees, value, cost, most, limited, self.budget or 0)
-            spare[: len(mu)] = mu
+            spare = np.zeros(self.count) if self.budget is None else mu
             # The bound of the module's text: of the entries, of the sensors, and of the budget.
             owner = np.zeros(len(entries), dtype=np.int64)
             pairs = sees.tocoo()

@@ -251,9 +251,8 @@ class MlflowLogger(_Tracker):
         place = (self._folder.resolve() / "mlflow").as_uri() if self._cfg.uri is None else None
         try:
             number = self._client.create_experiment(self._cfg.experiment, place)
-        except (
-            MlflowException
-        ):  # it is there, perhaps since another run of the sweep has made it just now
+        except MlflowException:
+            # It is there, perhaps since another run of the sweep has made it just now.
             if not (found := self._client.get_experiment_by_name(self._cfg.experiment)):
                 raise
             number = found.experiment_id
