@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import sparse
 
 from tests.helpers import random_kernel, small_world
 from tests.solvers.worlds import all_plans, best_of_all, followed, footprint_world
@@ -18,6 +19,7 @@ from trackmdp.recordings.tracks import Tracks
 from trackmdp.sensing.choose import largest
 from trackmdp.sensing.cover import Shared
 from trackmdp.sensing.decisions import sensing
+from trackmdp.sensing.programs import integer
 from trackmdp.solvers import bounds, lookahead, optimal, rules
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.solve import solve
@@ -97,6 +99,24 @@ def test_of_sensors_that_see_the_same_the_cheapest_counts(monkeypatch: pytest.Mo
     monkeypatch.setattr("trackmdp.sensing.cover._MOST", 7)
     with pytest.raises(UserError, match=r"coverage: 8 pairs of a cell .* expected at most 7"):
         one_move(world)
+
+
+@pytest.mark.parametrize(("budget", "on", "worth"), [(None, 2, 2.8), (1, 1, 1.9), (0, 0, 0.0)])
+def test_an_integer_program_keeps_to_the_budget(budget: int | None, on: int, worth: float) -> None:
+    """Each of three sensors sees two of three entries, of 1 each, for .1: shares of 1/2 would see all."""
+    sees = sparse.csr_array([[1.0, 1.0, 0.0], [0.0, 1.0, 1.0], [1.0, 0.0, 1.0]])
+    found, proved = integer(sees, np.ones(3), np.full(3, 0.1), budget)
+    assert found.sum() == on
+    assert proved == pytest.approx(worth, abs=1e-6)
+
+
+def test_shares_are_rounded_within_the_budget() -> None:
+    """Three sensors, each with an entry of its own that is worth .3, for .1; the third one has the smallest share."""
+    choice = one_move(from_cell_0(np.eye(4)[1:].tolist(), [0.1, 0.1, 0.1]).but(budget=2))
+    shares, price = np.array([0.7, 0.7, 0.6]), np.full(3, 0.1)
+    on, upper = choice._rounded(shares, np.full(3, 0.3), price, np.array([0.4, 0.0, 0.0, 0.0]))
+    assert on.tolist() == [True, True, False]
+    assert upper.tolist() == pytest.approx([0.4, 0.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("budget", BUDGETS)
