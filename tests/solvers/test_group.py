@@ -36,7 +36,7 @@ def tiny(seed: int, t_max: int = 0, **options: Any) -> World:
 
 def best_of_all(group: Group) -> float:
     """V* from a uniform start: every set tried in every joint state, by value iteration."""
-    sensors = range(group.task.num_cells)
+    sensors = np.flatnonzero(group.task.available).tolist()
     sets: list[IndexArray] = [
         np.array(each, dtype=np.int64)
         for k in range(len(sensors) + 1)

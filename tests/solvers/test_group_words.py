@@ -30,7 +30,10 @@ from trackmdp.world.model import World
             ["solve", "targets.count=2", "kernel=heading"],
             "kernel=heading: expected one without modes",
         ),
-        (["solve", "targets.count=2", "sensor=footprint"], "sensor=footprint: expected perfect"),
+        (
+            ["evaluate", "baseline=none", "targets.count=2", "sensor=false_alarm"],
+            "sensor=false_alarm: expected perfect, miss or footprint",
+        ),
         (["solve", "targets.count=2", "cost.mean_budget=1"], "cost.mean_budget=1"),
         (
             ["evaluate", "baseline=qmdp", "targets.count=2", "episodes=5"],

@@ -27,8 +27,8 @@ class TargetsConfig(NodeConfig):
         with_several = f"with {key}.count={self.count}"
         if root.kernel.hides:
             raise refuse("kernel", root.kernel.name, f"one without modes {with_several}")
-        if root.sensor.name not in ("perfect", "miss", "given"):
-            raise refuse("sensor", root.sensor.name, f"perfect or miss {with_several}")
+        if root.sensor.name == "false_alarm":
+            raise refuse("sensor", root.sensor.name, f"perfect, miss or footprint {with_several}")
         for place, value, expected in (
             ("grid.window", root.grid.window, None),
             ("task.memory", root.task.memory, "cell"),

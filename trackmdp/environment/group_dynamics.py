@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from trackmdp.environment.dynamics import State
 from trackmdp.environment.group_paths import GroupPaths
+from trackmdp.sensing.detection import Detection
 from trackmdp.sensing.outcomes import Costs
 from trackmdp.sensing.task import Task
 
@@ -33,9 +33,8 @@ class GroupDynamics:
         self._cells, self._max_steps, self._t_max = task.num_cells, task.max_steps, task.t_max
         self._costs, self._history = Costs(task, device), (task.num_choices, task.total_sensors)
         self._reward, self._safe = task.reward, task.safe_cost
-        # Of the sensors, and of the safe action.
-        chances = np.stack([task.detection, task.safe_detection])
-        self._detection = torch.as_tensor(chances, device=device)
+        self._report = Detection(task, device, everywhere=True)
+        self._safe_report = torch.as_tensor(task.safe_detection, device=device)
         self._available = torch.as_tensor(task.available, device=device)
         self.masked = not task.available.all()
 
@@ -75,9 +74,11 @@ class GroupDynamics:
         present, n = inside & state["present"], state["steps_since_detection"]
         forced = (n > self._t_max).any(-1, keepdim=True)
         on = action & self._available
-        report = on.gather(1, cell) | forced
-        if reports is not None:
-            report = report & (reports.view(shape) < self._detection[forced.long(), cell])
+        report = self._report(on, cell, cell)
+        if reports is None:
+            report = report | forced
+        else:
+            report = reports.view(shape) < torch.where(forced, self._safe_report[cell], report)
         seen, any_left = report & present, present.any(-1, keepdim=True)
         spent = self._costs.price_of(on).unsqueeze(-1)
         spent = torch.where(forced, self._safe, spent) * any_left

@@ -129,7 +129,7 @@ class _Batch:
     def _taken(self, step: GroupStep) -> Columns:
         """The columns of a step."""
         task, some = self._task, np.any(step.present, axis=1)
-        action = np.zeros((self._shape[0], task.num_cells), dtype=bool)
+        action = np.zeros((self._shape[0], task.total_sensors), dtype=bool)
         action.ravel()[step.on] = True
         spent = self._costs.price_of(torch.from_numpy(action))
         spent = torch.where(torch.from_numpy(step.late), task.safe_cost, spent)

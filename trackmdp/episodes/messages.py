@@ -197,7 +197,7 @@ class GroupForm(Form):
     def layers(self, episode: Episode, first_tick: int) -> Iterator[dict[str, bytes]]:
         """See `Form`."""
         (rows, columns), targets = self.task.size, len(episode.start)
-        sensed = episode.action.reshape(-1, rows, columns)
+        sensed = self.task.covered(episode.action).reshape(-1, rows, columns)
         for t, active in enumerate(boxes_of(sensed)):
             stamp = stamp_of(first_tick + t)
             each = episode.belief[t * targets : (t + 1) * targets].toarray()

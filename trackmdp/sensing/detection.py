@@ -45,29 +45,31 @@ class Detection:
             self._detection = torch.as_tensor(np.append(task.detection, 0.0), device=device)
 
     def __call__(self, action: Tensor, last: Tensor, target: Tensor) -> Tensor:
-        """`[B]`, float64 probability of a report; bool where all sensors are perfect.
+        """`[B]`, or `[B, T]` of T targets each, float64 probability of a report; bool where all sensors are perfect.
 
         Args:
             action: `[B, K]` bool, chosen from `last`.
-            last: `[B]` last located cells.
-            target: `[B]` cells of the targets; M after an exit, where the answer is of no meaning.
+            last: `[B]` last located cells; of no meaning for actions over all sensors.
+            target: `[B]` or `[B, T]` cells of the targets; M after an exit, where the answer is of no meaning.
         """
         if self._covering is not None:
+            sensors = self._covering[target]
             # Number S, the padding, is a sensor that is never on.
-            on = nn.functional.pad(action, (0, 1)).gather(1, self._covering[target])
+            on = nn.functional.pad(action, (0, 1)).gather(1, sensors.flatten(1)).view_as(sensors)
             if self.perfect:
                 return on.any(-1)
             return 1.0 - torch.where(on, self._misses[target], 1.0).prod(-1)
         sensor = self._window.find(last, target)
         # A number of at least K is no sensor: its target is outside the window or, clamped to a valid one, after its
         # exit.
-        on = action.gather(1, sensor.clamp_max(action.shape[1] - 1).unsqueeze(1)).squeeze(1)
+        place = sensor.clamp_max(action.shape[1] - 1).view(len(action), -1)
+        on = action.gather(1, place).view_as(sensor)
         if self._window.is_local:
             on = on & (sensor < action.shape[1])
         return self.of_cell(on, target)
 
     def of_cell(self, covered: Tensor, cell: Tensor) -> Tensor:
-        """As a call, for targets in `cell` `[B]`, of the bool `[B]` or probability `[B]` that a sensor there is on."""
+        """As a call, for targets in `cell`, of the bool or probability that a sensor there is on."""
         if self.perfect or self._covering is not None:
             return covered
-        return covered * self._detection.index_select(0, cell)
+        return covered * self._detection.take(cell)

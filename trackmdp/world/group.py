@@ -16,6 +16,7 @@ from trackmdp.config.several import MOST_TARGETS
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, grid_words
 from trackmdp.recordings.tracks import Recorded, Tracks
+from trackmdp.sensing.coverage import Coverage
 from trackmdp.sensing.task import Task
 from trackmdp.world.model import World
 from trackmdp.world.problem import Problem, modelled
@@ -38,7 +39,7 @@ class Group(Carded):
             alone; see `of_tracks`.
 
     Raises:
-        UserError: they differ in more than the motion, or have modes, footprints, a window or a memory.
+        UserError: they differ in more than the motion, or have modes, a window or a memory.
     """
 
     worlds: Sequence[World]
@@ -52,7 +53,6 @@ class Group(Carded):
         for number, world in enumerate(worlds):
             of_one = {
                 f"modes={world.modes}": world.modes > 1,
-                "footprints": world.coverage is not None,
                 f"grid.window={world.window}": world.window is not None,
                 f"task.memory={world.memory}": world.memory != "cell",
             }
@@ -259,7 +259,9 @@ def _alike(one: World, other: World) -> bool:
     """Whether two worlds are the same task."""
     theirs = other.given
     return all(
-        np.array_equal(mine, theirs[name], equal_nan=isinstance(mine, np.ndarray))
+        mine.same_as(theirs[name])
+        if isinstance(mine, Coverage)
+        else np.array_equal(mine, theirs[name], equal_nan=isinstance(mine, np.ndarray))
         for name, mine in one.given.items()
         if name not in ("place", "clip")
     )

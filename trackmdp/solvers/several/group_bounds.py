@@ -35,7 +35,8 @@ def upper_bound(group: Group) -> float:
         return math.nan
     equal = equal_shares(group)
     task = group.task
-    if len(group) != 2 or task.num_cells**2 > MOST_PAIRS or task.budget is not None:
+    apart = task.budget is None and task.coverage is None  # sensors are decided on one by one
+    if len(group) != 2 or task.num_cells**2 > MOST_PAIRS or not apart:
         return equal
     one, other = group.worlds
     first = _Paired(one, other).value
@@ -58,7 +59,8 @@ def equal_shares(group: Group) -> float:
 def sensors_suffice(task: Task) -> bool:
     """Whether all sensors together do what the safe action does, are no dearer, and are allowed by the budget."""
     dear = task.safe_cost >= float(np.nansum(task.cost)) * (1.0 - 1e-12)
-    return dear and task.perfect and bool(task.available.all()) and task.budget is None
+    everywhere = np.diff(task.sees_by_cell[:, task.available].indptr).all()
+    return dear and task.perfect and bool(everywhere) and task.budget is None
 
 
 @dataclass(frozen=True, eq=False)

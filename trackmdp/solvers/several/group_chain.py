@@ -11,6 +11,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.arrays.types import Array, IndexArray
+from trackmdp.sensing.decisions import report_chance
 from trackmdp.solvers.motion_totals import summed_over
 from trackmdp.solvers.pomdp import Chain, reached
 from trackmdp.solvers.several.merging import Beliefs, Clocks, Rule
@@ -75,7 +76,7 @@ def explored(
         forced = any(each and each[1] > group.task.t_max for each in joint)
         for on in [np.arange(0)] if forced else choices(joint):
             total, moves = np.zeros(6), defaultdict[Joint, float](float)
-            for chance, after, figures in _steps(group, joint, set(on.tolist()), forced):
+            for chance, after, figures in _steps(group, joint, on, forced):
                 total += chance * figures
                 if any(after):
                     moves[after] += chance
@@ -85,11 +86,11 @@ def explored(
 
 
 def _steps(
-    group: Group, joint: Joint, on: set[int], forced: bool
+    group: Group, joint: Joint, on: IndexArray, forced: bool
 ) -> Iterator[tuple[float, Joint, Array]]:
     """Probability, joint state after it and figures of every outcome of a step."""
     task = group.task
-    price = task.safe_cost if forced else float(task.paid[list(on)].sum())
+    price = task.safe_cost if forced else float(task.paid[on].sum())
     each = [[(1.0, False, None)] if not k else _outcomes(group, k, on, forced) for k in joint]
     for outcome in itertools.product(*each):
         chance = float(np.prod([part[0] for part in outcome]))
@@ -101,14 +102,13 @@ def _steps(
         yield chance, after, np.array([reward, inside, found, chosen * paid, forced and paid, 1.0])
 
 
-def _outcomes(group: Group, known: Known, on: set[int], forced: bool) -> list[Outcome]:
+def _outcomes(group: Group, known: Known, on: IndexArray, forced: bool) -> list[Outcome]:
     """What a step may lead to for one target: located in a state, missed, or gone."""
     task, (located, misses, belief) = group.task, known
     states, masses = (np.array(part) for part in zip(*belief, strict=True))
     moved = Beliefs(np.zeros(len(states), np.int64), states, masses).moved(group)
     cells = moved.state % task.num_cells
-    sees = np.array([cell in on for cell in cells]) * task.detection[cells]
-    sees = task.safe_detection[cells] if forced else sees
+    sees = task.safe_detection[cells] if forced else report_chance(task, on, 0 * cells, cells)
     found: list[Outcome] = [
         (float(p), True, (int(z), 0, ((int(z), 1.0),)))
         for p, z in zip(moved.mass * sees, moved.state, strict=True)

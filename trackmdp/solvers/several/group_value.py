@@ -11,10 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from trackmdp.arrays.entries import per_row, row_index
 from trackmdp.arrays.numbers import REAL
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.seeding import derive, whole_seed
+from trackmdp.sensing.decisions import report_chance
 from trackmdp.solvers.linear import accumulate
 from trackmdp.solvers.motion_totals import grid_of, summed_over
 from trackmdp.solvers.several.group_chain import joint_chain
@@ -94,7 +96,9 @@ def known_rewards(rule: Rule) -> list[Array]:
     rewards = []
     for world, sets in zip(rule.group.kinds, rule.first_sets(), strict=True):
         first = sets.astype(np.float64)
-        seen = world.kernel.multiply(first) @ world.detection
+        on, (row, cell) = first.tocoo(), (row_index(world.kernel), world.kernel.indices)
+        chance = report_chance(world, np.sort(on.row * world.total_sensors + on.col), row, cell)
+        seen = per_row(row, world.kernel.data * chance, world.num_cells)
         rewards.append(world.reward * seen - (first @ world.paid) * world.stay_probability)
     return rewards
 
@@ -156,8 +160,8 @@ def _totals(rule: Rule, targets: Moving, seed: int) -> Array:
     place = targets.state
     for step in group_steps(rule, targets, lambda *_: rng.random(shape), predicted=False):
         before, present, detections = step.before.present, step.present, step.seen.sum(axis=1)
-        some, episode = present.any(axis=1), step.on // rule.cells
-        price = np.bincount(episode, task.paid[step.on % rule.cells], shape[0])
+        some, (episode, sensor) = present.any(axis=1), np.divmod(step.on, rule.sensors)
+        price = np.bincount(episode, task.paid[sensor], shape[0])
         columns = (
             task.reward * detections - np.where(step.late, task.safe_cost, price) * some,
             present.sum(axis=1),

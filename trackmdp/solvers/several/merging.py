@@ -10,7 +10,8 @@ Merged by gains, sensor j is on iff
 
     sum over i of m_ij p_d(j) (r + V(j) - W_i(j))  >  c_j P(any target is in the grid),
 
-W_i(j) being the worth of going on with the plan of target i, the target being in j undetected.
+W_i(j) being the worth of going on with the plan of target i, the target being in j undetected. Of footprints it is the
+best set for these gains of all targets.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.policies.saved import packed
 from trackmdp.policies.table import PolicyTable
-from trackmdp.sensing.choose import largest
+from trackmdp.sensing.decisions import report_chance, sensing
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found
 from trackmdp.world.group import Group
@@ -148,7 +149,7 @@ class Rule(ABC):
     def __init__(self, group: Group, tables: Sequence[PolicyTable]) -> None:
         self.group, self.tables = group, tuple(tables)
         self.task = group.task
-        self.cells = self.task.num_cells
+        self.cells, self.sensors = self.task.num_cells, self.task.total_sensors
         if tables and len(tables) != len(group.kinds):
             raise UserError(
                 f"policy: number of plans {len(tables)}, expected {len(group.kinds)}, one for each motion"
@@ -170,7 +171,7 @@ class Rule(ABC):
 
     def start(self, located: IndexArray, present: BoolArray | None = None) -> Clocks:
         """Targets of E episodes located in the states `[E, K]`: all, or those that are `present` `[E, K]`."""
-        history = np.zeros((len(located), self.task.num_choices, self.cells), dtype=bool)
+        history = np.zeros((len(located), self.task.num_choices, self.sensors), dtype=bool)
         kept = history if self.reads_history else None
         here = np.ones(located.shape, dtype=bool) if present is None else present
         return Clocks(np.where(here, located, 0), np.zeros_like(located), here, kept)
@@ -178,6 +179,18 @@ class Rule(ABC):
     def first_sets(self) -> list[sparse.csr_array]:
         """For each kind `[M, S]`, the set of a single target that is located."""
         return [table.written[:: self.task.num_choices] for table in self.tables]
+
+    def own_sets(self, seen: Clocks) -> IndexArray:
+        """As `sets`, each target's own set, all of them together."""
+        free = seen.present & (seen.misses <= self.task.t_max)
+        found = []
+        for kind, table in enumerate(self.tables):
+            episode, target = np.nonzero(free & (self.group.kind == kind))
+            cell = seen.located[episode, target] - kind * self.cells
+            row = cell * self.task.num_choices + seen.misses[episode, target]
+            on = table.written[row].tocoo()
+            found.append(episode[on.row] * self.sensors + on.col)
+        return np.unique(np.concatenate(found))
 
     def packed(self) -> list[dict[str, Any]]:
         """The arrays from which it is made again, of each kind."""
@@ -200,15 +213,7 @@ class Union(Rule):
 
     def sets(self, seen: Clocks, moved: Beliefs) -> IndexArray:  # noqa: ARG002
         """See `Rule`."""
-        free = seen.present & (seen.misses <= self.task.t_max)
-        found = []
-        for kind, table in enumerate(self.tables):
-            episode, target = np.nonzero(free & (self.group.kind == kind))
-            cell = seen.located[episode, target] - kind * self.cells
-            row = cell * self.task.num_choices + seen.misses[episode, target]
-            on = table.written[row].tocoo()
-            found.append(episode[on.row] * self.cells + on.col)
-        return np.unique(np.concatenate(found))
+        return self.own_sets(seen)
 
 
 class Merged(Rule):
@@ -258,22 +263,15 @@ class Merged(Rule):
         row, state = moved.row[free], moved.state[free]
         located, misses = seen.located.ravel()[row], seen.misses.ravel()[row]
         cell, episode = state % self.cells, row // targets
-        gain = moved.mass[free] * self.credit(located, misses, state) * self.task.detects(cell)
-        codes, place = np.unique(episode * self.cells + cell, return_inverse=True)
-        gained = per_row(place, gain, len(codes))
+        gain = moved.mass[free] * self.credit(located, misses, state)
         inside = per_row(moved.row, moved.mass, episodes * targets)
         gone = 1.0 - inside.reshape(episodes, targets)
-        price = (
-            self.task.prices[codes % self.cells] * (1.0 - gone.prod(axis=1))[codes // self.cells]
-        )
-        net = gained - price
-        on = net > 0
-        if self.task.budget is not None:
-            kept = largest(
-                codes // self.cells, np.where(on, net, -np.inf)[:, None], self.task.budget
-            )
-            on &= kept[:, 0]
-        return codes[on]
+        each = sensing(self.task, episode, cell, episodes)
+        price = self.task.prices[each.sensors] * (1.0 - gone.prod(axis=1))[each.rows]
+        codes, own = each.rows * self.sensors + each.sensors, None
+        if self.task.coverage is not None:  # no worse, for these gains, than all own sets together
+            own = among(self.own_sets(seen), codes)[1][:, None]
+        return codes[each.best(gain[:, None], price[:, None], own)[:, 0]]
 
 
 def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str | None = None) -> Rule:
@@ -309,9 +307,9 @@ def followed(
     task, (present, seen) = group.task, report
     cell, episode = moved.state % task.num_cells, moved.row // present.shape[1]
     late, missed = clocks.late(task.t_max), (present & ~seen).ravel()
-    chance = among(on, episode * task.num_cells + cell)[1] * task.detects(cell)
-    chance = np.where(late[episode], task.safe_detection[cell], chance)
-    left = moved.given(missed, np.asarray(chance, dtype=np.float64), missed.size)
+    seen_with = report_chance(task, on, episode, cell)
+    chance = np.where(late[episode], task.safe_detection[cell], seen_with)
+    left = moved.given(missed, chance, missed.size)
     again = np.flatnonzero(seen.ravel())
     found = left.joined(Beliefs.at(again, place.ravel()[again]))
     # A target that has left keeps no clock; one that the safe action missed is due for the next one.

@@ -9,8 +9,8 @@ from typing import Protocol, TypeAlias
 
 import numpy as np
 
-from trackmdp.arrays.entries import among
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
+from trackmdp.sensing.decisions import report_chance
 from trackmdp.solvers.several.merging import Beliefs, Clocks, Rule, followed
 
 
@@ -82,24 +82,23 @@ def group_steps(
         draws: of the reports; asked for where sensors or the safe action may miss.
         predicted: whether beliefs are wanted where the policy does not read them.
     """
-    task, cells = rule.task, rule.cells
+    task, cells, sensors = rule.task, rule.cells, rule.sensors
     clocks, sure = rule.start(targets.state, targets.inside), task.perfect and task.safe
     beliefs = Beliefs.of(clocks)
-    episode = np.arange(len(targets.state))[:, None]
+    episode = np.repeat(np.arange(len(targets.state)), len(rule.group))
     for number in itertools.count() if task.max_steps is None else range(task.max_steps):
         if not len(row := np.flatnonzero(clocks.present.any(axis=1))):
             return
         moved = beliefs.moved(rule.group) if predicted or not rule.reads_history else Beliefs.none()
         late = clocks.late(task.t_max)
         on = rule.sets(clocks, moved)
-        on = on[~late[on // cells]]
+        on = on[~late[on // sensors]]
         targets.move(row, number)
         inside = targets.inside
         cell = np.where(inside, targets.state % cells, 0)
-        report = among(on, episode * cells + cell)[1] | late[:, None]
-        if not sure:
-            chance = np.where(late[:, None], task.safe_detection[cell], task.detection[cell])
-            report &= draws(row, number) < chance
+        chance = report_chance(task, on, episode, cell.ravel()).reshape(cell.shape)
+        chance = np.where(late[:, None], task.safe_detection[cell], chance)
+        report = chance > 0 if sure else draws(row, number) < chance
         seen = clocks.present & inside & report
         step = GroupStep(row, clocks, moved, on, late, cell, inside, seen)
         going = inside & ~targets.ended()[:, None]
