@@ -157,7 +157,6 @@ def test_policies_with_more_sensors_are_refused() -> None:
     [
         (["verify", "cost.budget=2"], "cost.budget=2: expected null here"),
         (["train", "cost.budget=2", "algo=hindsight"], "algo=hindsight: expected one of a2c, "),
-        (["solve", "cost.budget=2", "partition.block=5"], "cost.budget=2: expected null here"),
         (["solve", "cost.mean_budget=2", "solver=qmdp"], "cost.mean_budget=2"),
         (["evaluate", "baseline=qmdp", "cost.mean_budget=2"], "cost.mean_budget=2"),
         (["solve", "cost.mean_budget=2", "cost.budget=3"], "cost.mean_budget=2"),

@@ -11,6 +11,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from tests.typed import ENVIRONMENT, typed
 from trackmdp.app.cli import main
 from trackmdp.config.compose import compose
 from trackmdp.errors import Preempted, UserError
+from trackmdp.sensing.coverage import discs
 from trackmdp.signals import ENDING, Signals, handled, stop
 from trackmdp.solvers import optimal, regions, workers
 from trackmdp.solvers.partition import Block, blocks, default_halo, plan_by_blocks, reach, sub_world
@@ -59,6 +61,50 @@ def test_a_rectangle_has_the_moves_of_the_whole_grid() -> None:
     cells = (np.arange(2, 6)[:, None] * 9 + np.arange(3, 8)).ravel()
     part = sub_world(world, (range(2, 6), range(3, 8)))
     assert np.array_equal(part.kernel.toarray(), world.kernel.toarray()[np.ix_(cells, cells)])
+
+
+def test_footprints_are_cut_to_a_rectangle() -> None:
+    """Of sensors over cells 0 1, over 1 to 4, over 5, and over 3 with .5, the middle two cells are seen by two."""
+    covers = np.zeros((4, 6))
+    covers[0, :2] = covers[1, 1:5] = covers[2, 5] = 1
+    covers[3, 3] = 0.5
+    world = World(np.eye(6) / 2, (1, 6), cost=[1, 2, 3, 4], coverage=covers, budget=2)
+    part = sub_world(world, (range(1), range(2, 4)))
+    assert part.coverage is not None
+    np.testing.assert_array_equal(part.coverage.matrix.toarray(), [[1, 1], [0, 0.5]])
+    np.testing.assert_array_equal(part.cost, [2, 4])
+    assert (part.budget, part.safe_cost) == (2, 10)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"budget": 2, "window": 2},
+        {"spacing": 2},
+        {
+            "spacing": 1,
+            "budget": 1,
+            "window": 3,
+            "t_max": 0,
+        },  # a window wider than the halo of a move
+        pytest.param({"spacing": 2, "detection": 0.8, "budget": 2}, marks=pytest.mark.slow),
+    ],
+)
+def test_blocks_lose_nothing_with_footprints_and_a_budget(options: dict[str, Any]) -> None:
+    spacing = options.pop("spacing", None)
+    world = tm.make_world(
+        "random_support", size=(8, 7), support_size=4, radius=1, exit_probability=0.02, **options
+    )
+    if spacing is not None:
+        every = np.arange(56)[::spacing]
+        covers = discs((8, 7), np.stack(np.divmod(every, 7), axis=1), 1)
+        world = world.but(coverage=covers, cost=np.linspace(0.1, 0.3, len(every)))
+    whole, parts = tm.solve(world), tm.solve(world, block=3)
+    assert whole.lower - parts.lower <= 1e-6 * abs(whole.lower)
+    assert parts.upper >= whole.lower - 1e-9
+    assert np.diff(parts.table.written.indptr).max() <= (world.budget or world.total_sensors)
+    by_itself, apart = tm.solve(world, "qmdp"), tm.solve(world, "qmdp", block=3)
+    assert apart.lower == pytest.approx(by_itself.lower, rel=1e-9)
 
 
 def test_the_reach_is_that_of_the_longest_move() -> None:
@@ -312,6 +358,7 @@ def test_pythons_tracker_of_semaphores_does_not_die_of_the_groups_signals() -> N
 import signal
 from multiprocessing.resource_tracker import _resource_tracker as tracker
 from pathlib import Path
+from typing import Any
 from trackmdp.solvers.workers import starting
 with starting():
     tracker.ensure_running()
@@ -403,7 +450,7 @@ def test_a_policy_that_draws_cannot_be_put_together() -> None:
 def test_blocks_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["solve", "grid.size=8", f"hydra.run.dir={tmp_path / 'a'}"]
     assert main([*words, "partition.block=4", "partition.halo=1"]) == 0
-    assert "warning: partition.halo=1: below 3 = R (T_max + 2)" in " ".join(
+    assert "warning: partition.halo=1: below 3, so blocks" in " ".join(
         capsys.readouterr().out.split()
     )
     assert main([*words, "partition.halo=1"]) == 2

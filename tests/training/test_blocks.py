@@ -14,6 +14,7 @@ import pytest
 import trackmdp as tm
 from trackmdp.app.cli import main
 from trackmdp.errors import Preempted, UserError
+from trackmdp.sensing.coverage import discs
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.callbacks import Callback
 from trackmdp.training.lock import locked
@@ -73,6 +74,16 @@ def test_blocks_without_a_sensor_have_nothing_to_learn(tmp_path: Path) -> None:
     )
     assert run.evaluation.aihtr == pytest.approx(evaluate(world(cost=cost), run.policy).aihtr)
     assert len(list((tmp_path / "blocks").iterdir())) == 2  # of four
+
+
+def test_blocks_learn_with_footprints_and_a_budget() -> None:
+    places = np.stack(np.divmod(np.arange(0, 64, 2), 8), axis=1)
+    wide = world(window=None).but(
+        coverage=discs((8, 8), places, 1), cost=0.3, safe_cost=8.0, budget=1
+    )
+    run = tm.train(wide, "model_based", **SMALL | {"collector.total_frames": 3000})
+    assert run.evaluation.aihtr == evaluate(wide, run.policy).aihtr
+    assert 0 < evaluate(wide, run.policy).sensors_per_step <= 1
 
 
 @pytest.mark.slow
@@ -295,10 +306,6 @@ def test_what_does_not_go_together_with_blocks_is_refused(words: dict[str, Any],
             "partition.block=4: expected null with kernel=tracks",
         ),
         (["kernel=heading", "algo=ppo"], "partition.block=4: expected null with kernel=heading"),
-        (
-            ["sensor=footprint", "algo=ppo"],
-            "partition.block=4: expected null with sensor=footprint",
-        ),
     ],
 )
 def test_worlds_that_are_not_cut_to_blocks_are_refused(

@@ -13,7 +13,8 @@ class PartitionConfig(NodeConfig):
 
     block: int | None = count_option("side of a block; null = the whole grid is one", unit="cells")
     halo: int | None = option(
-        "cells around its own that a block includes; null = R (T_max + 2), R the reach of a move, which loses nothing",
+        "cells around its own that a block includes; null = R (T_max + 2), R the reach of a move, and with footprints "
+        "at least grid.window, which loses nothing",
         unit="cells",
         ge=0,
     )
@@ -35,8 +36,6 @@ class PartitionConfig(NodeConfig):
             return
         if not root.kernel.is_motion or root.kernel.hides:
             raise refuse(f"{key}.block", self.block, f"null with kernel={root.kernel.name}")
-        if root.sensor.covers:
-            raise refuse(f"{key}.block", self.block, f"null with sensor={root.sensor.name}")
         if not root.learns:
             return
         if [*root.log] not in ([], ["csv"]):

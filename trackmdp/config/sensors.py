@@ -64,11 +64,10 @@ class PaperCostConfig(CostConfig):
     def check(self, key: str, root: Any) -> None:
         """One price for all sensors, or one for each; a file is read later."""
         partition = getattr(root, "partition", None)
-        # Blocks settle what they share by trees, which decide on one cell at a time.
         by_blocks = partition is not None and partition.block is not None
         if self.budget is not None:
             require_able(root, "knows_budget", f"with {key}.budget={self.budget}")
-            if root.any_number or by_blocks:
+            if root.any_number:
                 expected = "null here, where any number of sensors is on"
                 raise refuse(f"{key}.budget", self.budget, expected)
         if self.mean_budget is not None:

@@ -21,7 +21,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.entries import row_index
+from trackmdp.arrays.entries import ones_at, row_index
 from trackmdp.arrays.types import BoolArray, IndexArray
 from trackmdp.config.by_blocks import PartitionConfig
 from trackmdp.errors import UserError
@@ -59,6 +59,10 @@ class Block:
         return (row[:, None] & column).ravel()
 
 
+_Planned: TypeAlias = tuple[int, World, Block, IndexArray]
+"""Number of a block, its world, itself, and the numbers of its sensors on the whole grid."""
+
+
 def reach(world: World) -> int:
     """R, the most rows or columns that a move can lead away."""
     return int(apart(world.columns, row_index(world.kernel), world.kernel.indices).max(initial=0))
@@ -66,7 +70,13 @@ def reach(world: World) -> int:
 
 def default_halo(world: World) -> int:
     """R (t_max + 2), how far away the target can be located next: t_max + 1 free choices and the safe action."""
-    return reach(world) * (world.t_max + 2)
+    return halo_of(world, world.t_max + 2)
+
+
+def halo_of(world: World, moves: int) -> int:
+    """Where the target can be after some moves, and of footprints all cells by which a window lets them be chosen."""
+    near = 0 if world.coverage is None else world.window or 0
+    return max(reach(world) * moves, near)
 
 
 def blocks(size: tuple[int, int], side: int, halo: int) -> list[Block]:
@@ -91,17 +101,42 @@ def blocks(size: tuple[int, int], side: int, halo: int) -> list[Block]:
 def sensing_blocks(world: World, side: int, halo: int) -> list[Block]:
     """The `blocks` of a grid that see a sensor: in others there is nothing to plan."""
     parts = blocks(world.size, side, halo)
-    return [part for part in parts if world.available[cells_of(part.seen, world.columns)].any()]
+    return [part for part in parts if world.available[sensors_of(world, part.seen)].any()]
+
+
+def sensors_of(world: World, seen: Rectangle) -> IndexArray:
+    """Numbers of the sensors that cover a cell of a rectangle, in order."""
+    cells = cells_of(seen, world.columns)
+    return cells if world.coverage is None else np.unique(world.coverage.by_cell[cells].indices)
 
 
 def sub_world(world: World, seen: Rectangle) -> World:
-    """The world inside a rectangle of the grid; a target that leaves it has exited."""
+    """The world inside a rectangle of the grid; a target that leaves it has exited.
+
+    Sensors are numbered as in `sensors_of`, and of their footprints the part in the rectangle is left.
+    """
     rows, columns = seen
-    cells = cells_of(seen, world.columns)
+    cells, sensors = cells_of(seen, world.columns), sensors_of(world, seen)
     kernel = within(world.kernel[cells], world, seen)
-    own = {name: getattr(world, name)[cells] for name in ("cost", "detection", "safe_detection")}
+    own = {name: getattr(world, name)[cells] for name in ("detection", "safe_detection")}
+    own |= {"cost": world.cost[sensors]}
+    if world.coverage is not None:
+        own |= {"coverage": within(world.coverage.matrix[sensors], world, seen)}
     # Its corner is another one.
     return World.of(world, kernel, size=(len(rows), len(columns)), place=None, **own)
+
+
+def sets_within(
+    sets: sparse.csr_array, world: World, seen: Rectangle, part: World
+) -> sparse.csr_array:
+    """`[K, S']`, of sets `[K, S]` the sensors that can be chosen in the world `part` of a rectangle, in its numbers."""
+    if world.coverage is None:
+        return within(sets, world, seen)
+    found = sets[:, sensors_of(world, seen)]
+    # At the edge of the halo a window may let a sensor be chosen by a cell beyond it.
+    row = row_index(found)
+    chosen = part.choosable(row // part.num_choices, found.indices)
+    return found if chosen is None else ones_at(row[chosen], found.indices[chosen], found.shape)
 
 
 def within(matrix: sparse.csr_array, world: World, seen: Rectangle) -> sparse.csr_array:
@@ -136,10 +171,11 @@ def plan_by_blocks(
     parts = sensing_blocks(world, block, default_halo(world) if halo is None else halo)
     ends = np.linspace(0, len(parts), min(_JOBS, len(parts)) + 1).astype(int)
 
-    def some(job: int) -> list[tuple[int, World, Block]]:
+    def some(job: int) -> list[_Planned]:
         # with their worlds: no worker needs the rest of the grid
         return [
-            (n, sub_world(world, parts[n].seen), parts[n]) for n in range(ends[job], ends[job + 1])
+            (n, sub_world(world, part.seen), part, sensors_of(world, part.seen))
+            for n, part in enumerate(parts[ends[job] : ends[job + 1]], ends[job])
         ]
 
     done = run(_PlanJob(plan, world.columns), Made(len(ends) - 1, some))
@@ -155,7 +191,7 @@ def narrow_halo(
         return None
     lost = max(upper - found.aihtr + found.error, 0.0) / found.expected_length
     return (
-        f"partition.halo={partition.halo}: below {wide} = R (T_max + 2), so blocks do not see all that they decide on; "
+        f"partition.halo={partition.halo}: below {wide}, so blocks do not see all that they decide on; "
         f"at most {lost:.4f} per step is lost"
     )
 
@@ -167,10 +203,10 @@ class _PlanJob:
     plan: Planner
     columns: int
 
-    def __call__(self, job: Sequence[tuple[int, World, Block]]) -> list[Pairs]:
+    def __call__(self, job: Sequence[_Planned]) -> list[Pairs]:
         return end_to_end([self._block(*each) for each in job])
 
-    def _block(self, number: int, world: World, block: Block) -> list[Pairs]:
+    def _block(self, number: int, world: World, block: Block, sensors: IndexArray) -> list[Pairs]:
         table = self.plan(number, world)
         table.check_fits(world)
         if not table.deterministic:
@@ -178,9 +214,9 @@ class _PlanJob:
         sets = table.written
         # Row 7 of a table with two choices is cell 3 after one miss.
         cell, n = np.divmod(row_index(sets), world.num_choices)
-        numbers, kept = cells_of(block.seen, self.columns), block.mine[cell]
+        cells, kept = cells_of(block.seen, self.columns), block.mine[cell]
         on = (np.flatnonzero(kept & (n == each)) for each in range(world.num_choices))
-        return [(numbers[cell[each]], numbers[sets.indices[each]]) for each in on]
+        return [(cells[cell[each]], sensors[sets.indices[each]]) for each in on]
 
 
 def end_to_end(parts: Sequence[Sequence[Pairs]]) -> list[Pairs]:

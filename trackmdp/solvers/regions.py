@@ -32,10 +32,12 @@ from trackmdp.solvers.partition import (
     Pairs,
     cells_of,
     end_to_end,
+    halo_of,
     reach,
     sensing_blocks,
+    sensors_of,
+    sets_within,
     sub_world,
-    within,
 )
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.value import value_of
@@ -58,6 +60,7 @@ class _Region:
     Attributes:
         world: the part of the world that it sees.
         cells: `[L]`, numbers of the region's cells on the whole grid.
+        sensors: the same of its sensors.
         own: `[L]`, the located cells of its plans.
         policy: the one at hand.
         value: `[L]`, V.
@@ -66,6 +69,7 @@ class _Region:
 
     world: World
     cells: IndexArray
+    sensors: IndexArray
     own: BoolArray
     policy: PolicyTable
     value: Array
@@ -99,7 +103,7 @@ class _Region:
         found = []
         for choice, on in zip(self.problem.renewal.choices, sets, strict=True):
             mine = on[:, 0] & self.own[choice.rows]
-            found.append((self.cells[choice.rows[mine]], self.cells[choice.sensors[mine]]))
+            found.append((self.cells[choice.rows[mine]], self.sensors[choice.sensors[mine]]))
         return found
 
 
@@ -177,15 +181,16 @@ def _region_bytes(world: World, side: int) -> int:
 def _regions(world: World, policy: PolicyTable, value: Array, side: int) -> Made[_Region]:
     detected = world.reward + value
     worth = (value, detected, forced_worth(world, detected))
-    parts = sensing_blocks(world, side, reach(world) * world.num_choices)
+    parts = sensing_blocks(world, side, halo_of(world, world.num_choices))
 
     def region(number: int) -> _Region:
         block = parts[number]
         cells, here = cells_of(block.seen, world.columns), sub_world(world, block.seen)
         states = (cells[:, None] * world.num_choices + np.arange(world.num_choices)).ravel()
         rows = policy.sets if policy.alike else policy.sets[states]
-        mine = PolicyTable(here, within(rows, world, block.seen))
-        return _Region(here, cells, block.mine, mine, *(each[cells] for each in worth))
+        mine = PolicyTable(here, sets_within(rows, world, block.seen, here))
+        sensors = sensors_of(world, block.seen)
+        return _Region(here, cells, sensors, block.mine, mine, *(each[cells] for each in worth))
 
     return Made(len(parts), region)
 

@@ -13,7 +13,6 @@ from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.by_blocks import SweptPartitionConfig
 from trackmdp.config.compose import compose, default, given
 from trackmdp.config.registry import make, maker
-from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.linear import DIRECT_CELLS
 from trackmdp.solvers.partition import blocks, narrow_halo, plan_by_blocks
@@ -113,10 +112,6 @@ def run_solver(
         return _modes(world, choice, start, on_progress)
     if world.memory != "cell":  # the state is known at a detection: more of the past is of no use
         world = world.but(memory="cell")
-    if world.coverage is not None and partition is not None and partition.block is not None:
-        raise UserError(
-            f"partition.block={partition.block}: expected null with sensors that have footprints"
-        )
     started = time.monotonic()
     if partition is not None and partition.block is not None:
         workers = min(partition.workers, len(blocks(world.size, partition.block, halo=0)))
