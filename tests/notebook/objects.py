@@ -33,6 +33,7 @@ def objects() -> dict[str, Any]:
     world = tm.make_world(size=(3, 4), cost=0.16)
     run = tm.train(world, "model_based", seed=3, **SHORT)
     solution = tm.solve(world)
+    tradeoff = tm.frontier(tm.make_world("drift", size=3), resolution=0.1)
     return {
         "world": world,
         "hidden": headings(),
@@ -46,7 +47,9 @@ def objects() -> dict[str, Any]:
         "episode": tm.simulate(world, solution, 1)[0],
         "comparison": tm.compare(world, ["qmdp", solution]),
         "policy": solution.policy,
-        "tradeoff": tm.frontier(tm.make_world("drift", size=3), resolution=0.1),
+        "tradeoff": tradeoff,
+        "corner": tradeoff.corners[1],
+        "mixture": tradeoff.at(accuracy=0.9),
     }
 
 
@@ -64,4 +67,6 @@ NAMES = (
     "comparison",
     "policy",
     "tradeoff",
+    "corner",
+    "mixture",
 )

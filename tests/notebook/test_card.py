@@ -103,6 +103,17 @@ def test_a_solution_names_its_bracket_and_whether_it_is_closed() -> None:
     assert "optimal" not in repr(apart)
 
 
+def test_a_mixture_names_its_corners_with_their_probabilities() -> None:
+    mixture = objects()["mixture"]
+    found = values(mixture)
+    assert found["accuracy"] == "90.00 %"
+    assert len(mixture.parts) == 2
+    for weight, corner in mixture.parts:
+        place = found[f"with probability {weight:.4f}"]
+        assert f"price {corner.price:g}," in place
+        assert values(corner)["price of a sensor"] == f"{corner.price:g}"
+
+
 def test_an_evaluation_leaves_out_start_cells_without_a_value() -> None:
     evaluation = objects()["evaluation"]
     value = evaluation.value.copy()

@@ -45,14 +45,20 @@ class Corner(Solution):
     sensors: float
     net: float
 
+    def card(self) -> Card:
+        """The price, above the card of the solution."""
+        card = super().card()
+        title = card.title.replace("Solution", "Corner", 1)
+        return Card(title, {"price of a sensor": f"{self.price:g}"} | card.facts)
+
     @property
     def accuracy(self) -> float:
         """Detections per step in the grid, forced ones included."""
         return self.evaluation.accuracy
 
 
-@dataclass(frozen=True)
-class Mixture:
+@dataclass(frozen=True, eq=False, repr=False)
+class Mixture(Carded):
     """A draw between two neighbouring corners at the start of each episode, or one of them alone.
 
     Attributes:
@@ -66,6 +72,19 @@ class Mixture:
     accuracy: float
     sensors: float
     net: float
+
+    def card(self) -> Card:
+        """The figures, and each corner with its probability."""
+        facts = {
+            "accuracy": percent(self.accuracy),
+            "sensors per step": decimal(self.sensors, 4),
+            "net": decimal(self.net, 4),
+        }
+        for weight, corner in self.parts:
+            facts[f"with probability {weight:.4f}"] = (
+                f"the corner at price {corner.price:g}, {corner.sensors:.4f} sensors per step"
+            )
+        return Card("Mixture: one policy, drawn at the start of each episode", facts)
 
     @classmethod
     def of(cls, *parts: tuple[float, Corner]) -> Mixture:
