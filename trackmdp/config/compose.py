@@ -134,7 +134,7 @@ def known_options(values: dict[str, Any], schema: type[Any]) -> dict[str, Option
 def _by_option(given: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Options by their dotted names; a mapping, as in ``{"algo.entropy": {"start": 0.1}}``, holds those of a node."""
     for name, value in given.items():
-        if isinstance(value, Mapping):
+        if isinstance(value, Mapping) and value:
             yield from _by_option(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", _plain(value)
