@@ -17,6 +17,10 @@ class UserError(ValueError):
     `SystemExit`, so that one bad job does not end a whole Hydra sweep.
     """
 
+    def __init__(self, message: str) -> None:
+        # The text of what was given, such as an array or a world, may have several lines.
+        super().__init__(" ".join(line.strip() for line in message.splitlines()))
+
 
 class OutputError(UserError, OSError):
     """A file that is to be written has no place; an `OSError`, since within a run its folder went away."""
