@@ -122,6 +122,18 @@ def test_own_tracks() -> None:
     assert keyed > learned > max(all_on, none, qmdp)
 
 
+def test_a_sweep_that_is_refused_ends_as_its_command_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(sys, "argv", ["sweep.py", str(tmp_path / "file")])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(EXAMPLES / "sweep.py"), run_name="__main__")
+    assert ended.value.code == 2
+    said = capsys.readouterr()
+    assert said.out == "" and "hydra.sweep.dir=" in said.err and "report" not in said.err
+
+
 @pytest.mark.slow
 def test_sweep(tmp_path: Path) -> None:
     """The page holds the four runs, and a figure of them against the price."""

@@ -17,8 +17,10 @@ WORLDS = (
 
 def main(folder: Path) -> None:
     """Train in four worlds, each in a process of its own, and print where the page about them is."""
-    trackmdp(["train", "-m", *WORLDS, f"hydra.sweep.dir={folder}", "quiet=true"])
-    trackmdp(["report", f"sweep={folder}", "quiet=true"])
+    train = ["train", "-m", *WORLDS, f"hydra.sweep.dir={folder}"]
+    for words in (train, ["report", f"sweep={folder}"]):
+        if status := trackmdp([*words, "quiet=true"]):
+            sys.exit(status)
     print(folder / "report" / "report.html")
 
 
