@@ -163,8 +163,10 @@ def test_an_example_is_printed_by_its_name(capsys: pytest.CaptureFixture[str]) -
     assert {file.stem for file in folder.glob("*.py")} <= set(names) and "city.csv" in names
     assert main(["example", "own_policy"]) == 0
     assert capsys.readouterr().out == (folder / "own_policy.py").read_text()
-    assert main(["example", "own"]) == 2
-    assert capsys.readouterr().err.startswith("trackmdp: example own: expected one of ")
+    for names in (["own"], ["own_policy", "memory"]):
+        assert main(["example", *names]) == 2
+        message = f"trackmdp: example {' '.join(names)}: expected one of "
+        assert capsys.readouterr().err.startswith(message)
 
 
 @pytest.mark.parametrize(

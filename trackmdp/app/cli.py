@@ -182,7 +182,9 @@ def _example(names: list[str]) -> str:
     """The text of an example; without a name all names."""
     from trackmdp.examples import example_file, examples
 
-    return example_file(names[0]).read_text("utf-8") if names else "\n".join([*examples(), ""])
+    return (
+        example_file(" ".join(names)).read_text("utf-8") if names else "\n".join([*examples(), ""])
+    )
 
 
 def _overview() -> str:
