@@ -66,6 +66,7 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
             "replay file=möß.mcap",
             "file=möß.mcap: expected option=value (a value with commas or letters beyond a to z needs quotes: ",
         ),
+        ("train hydra.run.dir=~/a", "hydra.run.dir=~/a: expected $HOME in place of ~"),
         ("train seed=0,1", "seed=0,1: expected one value; add -m"),
         ("train algo=[a2c,ppo]", "algo=[a2c,ppo]: expected one choice, not a list"),
         ("train -m seed=range(10000000)", "seed=range(10000000): expected 1 to 100,000 values"),

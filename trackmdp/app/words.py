@@ -33,6 +33,8 @@ def parsed(word: str) -> Override:
     try:
         override = OverridesParser.create().parse_override(word)
     except (HydraException, ValueError) as error:  # ValueError: an integer of thousands of digits
+        if "=~" in word:  # in quotes it would be a folder of that name
+            raise UserError(f"{word}: expected $HOME in place of ~") from error
         raise UserError(
             f"{word}: expected option=value (a value with commas or letters beyond a to z needs quotes: \"'...'\")"
         ) from error
