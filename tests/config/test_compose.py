@@ -98,6 +98,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "kernel.low_probability=0.2: without effect with support_size=1",
     ),
     ({"algo.lr": 0.5}, "algo.lr: renamed, expected algo.learning_rate"),
+    ({"grid": 5}, "grid=5: expected grid.size=value"),
     ({"grid.size": {}}, "grid.size={}: expected an integer >= 1"),
     ({"algo.epocs": {}}, "algo.epocs: unknown option, did you mean algo.epochs"),
 ]

@@ -158,11 +158,20 @@ def test_hooks_are_called_in_order(tmp_path: Path) -> None:
         ({"collector": "singel"}, "collector=singel: expected one of"),
         ({"gamma": 2}, "algo.gamma=2: expected a number from 0 to 1"),
         ({"collector.workers": 2}, "collector.workers"),
+        ({"optimal": False}, "optimal=False: expected optimal.enabled=value"),
+        ({"resume": "auto"}, "resume=auto: expected folder=FOLDER beside it"),
+        (
+            {"task.memory": "displacement"},
+            "task.memory: of the problem, expected where that is made",
+        ),
+        ({"cost": {"budget": 1}}, "cost: of the problem, expected where that is made"),
+        ({"kernel": "drift"}, "kernel: of the problem, expected where that is made"),
+        ({"targets.count": 2}, "targets.count: of the problem, expected where that is made"),
     ],
 )
 def test_a_wrong_option_is_refused_in_one_line(given: dict[str, Any], told: str) -> None:
     with pytest.raises(UserError) as caught:
-        train(small_world(), "ppo", **given)
+        train(small_world(), "ppo", **QUICK | given)
     assert str(caught.value).startswith(told)
     assert "\n" not in str(caught.value)
 

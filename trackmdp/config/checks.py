@@ -98,6 +98,8 @@ def check_option(key: str, value: Any, known: Mapping[str, Option]) -> None:
         UserError: it is one; the message names the option that may be meant.
     """
     if key not in known:
+        if inner := [name for name in known if name.startswith(f"{key}.")]:
+            raise UserError(f"{key}={value}: expected {inner[0]}=value (known: {', '.join(inner)})")
         *parents, _ = itertools.accumulate(key.split("."), "{}.{}".format)
         if above := next((each for each in parents if each in known), None):
             raise UserError(f"{above}: a mapping, expected {known[above].expected}")

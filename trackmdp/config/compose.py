@@ -22,7 +22,7 @@ from trackmdp.config.checks import (
     refuse_ignored,
     validate,
 )
-from trackmdp.config.options import GROUPS, Node, Option, leaves, options
+from trackmdp.config.options import GROUPS, Option, leaves, options
 from trackmdp.config.registry import choice_values, read_values, resolved
 from trackmdp.config.roots import ROOTS
 from trackmdp.errors import UserError
@@ -43,7 +43,7 @@ def compose(command: str, overrides: Mapping[str, Any] | None = None) -> Any:
     known = known_options(values, schema)
     # After all choices, so that `algo.epochs` is looked up among the options of the chosen algorithm.
     for key, value in typed.items():
-        if not isinstance(options(schema).get(key), Node):
+        if key not in GROUPS or key not in options(schema):
             check_option(key, value, known)
             *parents, last = key.split(".")
             node = values

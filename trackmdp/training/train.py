@@ -29,6 +29,9 @@ from trackmdp.training.run import Run, complete
 from trackmdp.untrusted import reason
 from trackmdp.world.group import Group, Subject, check_problem, learned_in
 
+_OF_PROBLEM = ("grid", "kernel", "cost", "task", "sensor")
+"""Options that the command makes a problem of; from Python it is made before."""
+
 
 def train(
     problem: Subject,
@@ -78,8 +81,8 @@ def train(
     if wrong:
         raise UserError(f"callbacks: a {type(wrong[0]).__name__}, expected a list of Callback")
     place = None if folder is None else path_of(folder, "folder")
-    if place is None and options.get("log"):
-        raise UserError(f"log={options['log']}: expected folder=FOLDER beside it, for its files")
+    if place is None and (name := next((n for n in ("log", "resume") if options.get(n)), None)):
+        raise UserError(f"{name}={options[name]}: expected folder=FOLDER beside it, for its files")
     nets = _nets(problem, {"actor": actor, "critic": critic}, place)
     typed = {_key(name): value for name, value in options.items()}
     typed |= given({"algo": algo}) | {"seed": seed, "quiet": not progress}
@@ -112,6 +115,11 @@ def _config(
     problem: Subject, typed: dict[str, Any], folder: Path | None
 ) -> tuple[TrainConfig, Subject]:
     """The checked config, and what the learner learns in: of several targets all, or a single one."""
+    for name in typed:
+        if name.partition(".")[0] in _OF_PROBLEM or name == "targets.count":
+            raise UserError(
+                f"{name}: of the problem, expected where that is made (make_world, World, load_tracks)"
+            )
     config: TrainConfig = compose("train", typed | words_of(problem, folder))
     subject = learned_in(problem, config.targets.count, joint=config.algo.joint)
     if subject is not problem:  # the words name the problem that is in the run's folder
