@@ -64,8 +64,8 @@ def train(
         actor: of `a2c` and `ppo`, in place of theirs: a `ProbabilisticActor` with `return_log_prob=True` that reads
             keys of the state, or `observation` (`ObservationVector`). It is trained in place, in memory alone.
         critic: of the same: a module that reads such keys and writes `state_value` `[B, 1]`.
-        options: those of the command line. A name without a dot that the command does not have is the algorithm's;
-            a dict holds several options of one node.
+        options: those of the command line, without those of the problem. A name without a dot that the command does
+            not have is the algorithm's; a dict holds several options of one node.
 
     Raises:
         UserError: a name, type or range is wrong, there is not enough memory, or the folder holds another run.
