@@ -69,9 +69,11 @@ def test_sets_in_an_array_are_a_policy(problem: World | Recorded) -> None:
     assert first.figures == second.figures
 
 
-def test_q_mdp_on_tracks_is_that_of_the_kernel_estimated_from_them() -> None:
+@pytest.mark.parametrize("window", [None, 0])
+def test_q_mdp_on_tracks_is_that_of_the_kernel_estimated_from_them(window: int | None) -> None:
     """As `train` and `evaluate` show it."""
-    problem = recorded(drawn(WORLD.kernel, 200, 1), drawn(WORLD.kernel, 60, 2))
+    tracks = drawn(WORLD.kernel, 200, 1), drawn(WORLD.kernel, 60, 2)
+    problem = recorded(*tracks, window=window)
     evaluator = HeldOutEvaluator(problem)
     shown = evaluator.held_out(tm.Policy.none(problem))["figures"][ESTIMATED]["aihtr"]["mean"]
     assert tm.compare(problem, ["qmdp", "none"]).policies[0].figures["aihtr"].mean == shown

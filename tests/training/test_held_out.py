@@ -123,10 +123,14 @@ def test_the_estimated_kernel_is_that_of_the_tracks() -> None:
     ).all()  # where the recording stopped nobody left
 
 
-def test_q_mdp_of_the_estimated_kernel_is_that_of_the_kernel() -> None:
-    """The price is .2, the probabilities .6 and .3: none is so near to it that the estimate would matter."""
+@pytest.mark.parametrize("window", [None, 1])
+def test_q_mdp_of_the_estimated_kernel_is_that_of_the_kernel(window: int | None) -> None:
+    """The price is .2, the probabilities .6 and .3: none is so near to it that the estimate would matter.
+
+    From cell 0 cell 2 is outside of a window of 1.
+    """
     kernel = 0.6 * np.roll(np.eye(9), 2, axis=1) + 0.3 * np.roll(np.eye(9), 1, axis=1)
-    setting = recorded(drawn(sparse.csr_array(kernel), 5_000), by_hand([0, 1]))
+    setting = recorded(drawn(sparse.csr_array(kernel), 5_000), by_hand([0, 1]), window=window)
     world = World(
         kernel,
         3,
@@ -134,6 +138,7 @@ def test_q_mdp_of_the_estimated_kernel_is_that_of_the_kernel() -> None:
         safe_cost=setting.safe_cost,
         t_max=setting.t_max,
         reward=setting.reward,
+        window=window,
     )
     assert np.array_equal(
         HeldOutEvaluator(setting).references[ESTIMATED].dense(), rules.qmdp(world).dense()

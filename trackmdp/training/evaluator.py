@@ -186,7 +186,7 @@ def fixed_policies(task: Task) -> dict[str, PolicyTable]:
 def estimated_qmdp(task: Recorded) -> PolicyTable:
     """Q_MDP of the kernel estimated from the tracks to learn from."""
     kernel = estimated_kernel(task.tracks, task.size)
-    return rules.qmdp(World.of(task, kernel, max_steps=None, window=None, memory="cell"))
+    return rules.qmdp(World.of(task, kernel, max_steps=None, memory="cell"))
 
 
 def estimated_kernel(tracks: Tracks, size: tuple[int, int]) -> sparse.csr_array:
