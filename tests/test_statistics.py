@@ -155,6 +155,15 @@ def test_events_that_were_never_seen_may_happen_all_the_same() -> None:
     assert ratio(np.zeros(25), np.ones(25)).high == 0.0
 
 
+def test_events_that_most_units_have_are_not_rare() -> None:
+    """Of 40 units each has 60 to 70 events in 100 steps: that none is without says nothing about the rate."""
+    part, whole = 60.0 + np.arange(40) % 11, np.full(40, 100.0)
+    assert ratio(part, whole, events=True) == ratio(part, whole)
+    # One in each of them is no spread.
+    alike = ratio(np.ones(40), np.ones(40), events=True)
+    assert alike.low == pytest.approx(0.025 ** (1 / 40))
+
+
 @pytest.mark.slow
 def test_intervals_over_tracks_cover() -> None:
     """Tracks of 30 steps on average; how often the target is missed differs between them, and rarely it takes D.

@@ -105,8 +105,8 @@ def ratio(part: Values, whole: Values, *, events: bool = False) -> MeanInterval:
     Args:
         part: `[n]`, the sum of each unit.
         whole: `[n]`, the denominator of each unit.
-        events: `part` counts rare events, which few units have. Without any there is no spread to resample, so the
-            interval is widened to the interval of the share of units with any, at their events per unit.
+        events: `part` counts events that may be rare. Where fewer than `_FEW` units have some, or there is no spread to
+            resample, the interval is widened to that of the share of units with any, at their events per unit.
     """
     count, total = len(part), float(whole.sum())
     if not total:
@@ -115,15 +115,15 @@ def ratio(part: Values, whole: Values, *, events: bool = False) -> MeanInterval:
     if count < FEWEST:
         return MeanInterval(mean, None, None, count)
     low, high = _bootstrap_t(part, whole, mean)
-    if events:
-        having = part > 1e-9  # more than rounding
+    having = part > 1e-9  # more than rounding
+    if events and (having.sum() < _FEW or low == high):
         # Example: 40 tracks, none with a safe action. The bootstrap resamples zeros and would end at 0; the share of
         # tracks that have one may be up to 8.8 %, each with one event (`size`), over `total` steps.
         known = share(int(having.sum()), count)
         size = float(part[having].mean()) if having.any() else 1.0
         low = min(low, (known.low or 0.0) * size * count / total)
         high = max(high, (known.high or 1.0) * size * count / total)
-        low = max(low, 0.0)
+    low = max(low, 0.0) if events else low
     return MeanInterval(mean, low, high, count)
 
 
