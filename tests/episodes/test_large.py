@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from trackmdp.episodes.player import WIDE, frame
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.errors import UserError
 from trackmdp.sensing.task import Task
+from trackmdp.world.group import group_of
 from trackmdp.world.make import make_world
 
 
@@ -173,3 +175,19 @@ def test_an_episode_that_does_not_fit_is_refused_before_its_layers_are_made(
         free -= 1
         with pytest.raises(UserError, match="steps on 3,000 cells: needs about"):
             list(made.complete())
+
+
+@pytest.mark.parametrize(("targets", "side"), [(1, 50), (40, 10)])
+def test_long_episodes_are_completed_a_few_at_a_time(targets: int, side: int) -> None:
+    """600 steps of 2,500 cells, or of 40 targets that may be in 30 cells each: 5 times as many numbers are kept."""
+    world = make_world("random_walk", size=side, exit_probability=0, max_steps=600)
+    made: Any = tm.simulate(world if targets == 1 else group_of(world, targets), "none", 10)
+    together = []
+
+    def completed(begin: int, end: int) -> list[Episode]:
+        together.append(end - begin)
+        return made[begin:end]
+
+    object.__setattr__(made, "_completed", completed)
+    assert [each.number for each in made.complete()] == list(range(10))
+    assert together == [5, 5]

@@ -27,6 +27,7 @@ from trackmdp.solvers.several.merging import Rule
 from trackmdp.world.group import Subject
 
 _BELIEF = 25_600  # cells, or hidden states, of the beliefs updated together: memory stays bounded on large grids
+_NUMBERS = 2**23  # of the beliefs that are kept together: memory stays bounded with long episodes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -188,11 +189,11 @@ class Episodes(Carded, Sequence[Episode]):
         )
 
     @property
-    def _at_once(self) -> int:
-        """Episodes that are completed together: memory stays bounded on large grids."""
-        world = self.problem.model
-        states = self.problem.num_cells if world is None else world.num_states
-        return max(1, min(256, _BELIEF // states))
+    def _at_once(self) -> tuple[int, int]:
+        """Episodes that are completed together at most, and steps of them where it is more than one."""
+        world, cells = self.problem.model, self.problem.num_cells
+        states = cells if world is None else world.num_states
+        return max(1, min(256, _BELIEF // states)), _NUMBERS // cells
 
     def _completed(self, begin: int, end: int) -> Iterator[Episode]:
         """See `complete`; those from number `begin` to `end` - 1."""
@@ -216,8 +217,12 @@ class Episodes(Carded, Sequence[Episode]):
 
         Recorded tracks have no motion model; the belief of one target is 0 in all cells.
         """
-        for begin in range(0, len(self), self._at_once):
-            yield from self._completed(begin, min(begin + self._at_once, len(self)))
+        end, (most, steps) = 0, self._at_once
+        while (begin := end) < len(self):
+            # Of lengths 2 1 3 `first` is 0 2 3 6: four steps end after the second episode, and one within the first.
+            fits = np.searchsorted(self.first, self.first[begin] + steps, side="right") - 1
+            end = min(max(int(fits), begin + 1), begin + most)
+            yield from self._completed(begin, end)
 
     def to_tensordict(self) -> TensorDict:
         """`[S]` the steps of all episodes, as of `Episode.to_tensordict`, and the number of each, `episode`."""

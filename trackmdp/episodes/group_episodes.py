@@ -26,7 +26,7 @@ from trackmdp.world.group import Group
 _AT_ONCE = 4096
 """Targets of the episodes that are stepped together; 256 steps of their draws are held, 8 MB."""
 _BELIEFS = 2**22
-"""Numbers of the beliefs that are kept together, at most, if a target may be in 30 cells in each of 100 steps."""
+"""Numbers of the beliefs that are kept together, at most, if a target may be in 30 cells in each step."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -78,8 +78,9 @@ class GroupEpisodes(Episodes):
         ]
 
     @property
-    def _at_once(self) -> int:
-        return max(1, min(_AT_ONCE, _BELIEFS // 3000) // len(self.problem))
+    def _at_once(self) -> tuple[int, int]:
+        targets = len(self.problem)
+        return max(1, _AT_ONCE // targets), _BELIEFS // (30 * targets)
 
     def _completed(self, begin: int, end: int) -> Iterator[Episode]:
         """Simulated once more."""
