@@ -40,13 +40,19 @@ def whole_file(file: Path) -> Iterator[BufferedRandom]:
     part = _part(file)
     if not file.parent.is_dir():  # else the message would name the hidden file
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(file.parent))
+    with no_trace(part, file), create(part) as stream:
+        yield stream
+        # Before the renaming, which may reach the disk before the bytes do: a power failure would leave an empty file
+        # under the final name.
+        sync(stream, part)
+        part.replace(file)
+
+
+@contextmanager
+def no_trace(part: Path, file: Path) -> Iterator[None]:
+    """Remove `part` if `file`, which it is to become, cannot be written, and name that in the error."""
     try:
-        with create(part) as stream:
-            yield stream
-            # Before the renaming, which may reach the disk before the bytes do: a power failure would leave an empty
-            # file under the final name.
-            sync(stream, part)
-            part.replace(file)
+        yield
     # Ctrl-C included; outside of the `with`, which closes the stream and so tries once more to write what is left.
     except BaseException as error:
         part.unlink(missing_ok=True)

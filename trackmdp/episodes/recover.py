@@ -12,6 +12,7 @@ from typing import BinaryIO
 
 from mcap.records import Attachment, Chunk, DataEnd, Metadata
 
+from trackmdp.durable import no_trace
 from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged, Said
 from trackmdp.episodes.schema import TABLES
@@ -40,11 +41,12 @@ def recover(file: Path) -> Recovered:
     # Not overwritten: it may be the result of an earlier recovery, and `file` may have been damaged further.
     if target.exists():
         raise UserError(f"file={file}: {target} already exists")
-    writer, damaged = _rewrite(file, target)
-    if writer is None:
-        lost = "its metadata or its problem are lost"
-        raise UserError(f"file={file}: too damaged, {lost} ({'; '.join(damaged)})")
-    return Recovered(writer.finish(), writer.episodes, tuple(damaged))
+    with no_trace(target.with_name(f"{target.name}.part"), target):
+        writer, damaged = _rewrite(file, target)
+        if writer is None:
+            lost = "its metadata or its problem are lost"
+            raise UserError(f"file={file}: too damaged, {lost} ({'; '.join(damaged)})")
+        return Recovered(writer.finish(), writer.episodes, tuple(damaged))
 
 
 def taken_over(file: Path, target: Path, policies: int) -> EpisodeWriter | None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from trackmdp.arrays.types import BoolArray
+from trackmdp.durable import no_trace
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.episode_page import MOST_STEPS
 from trackmdp.episodes.sentences import sentence
@@ -38,14 +39,12 @@ def write_video(file: Path, task: Task, episode: Episode, speed: int) -> None:
     figure = Figure(figsize=(min(6.4, 2 + 5.0 * columns / max(rows, columns)), 6.4), dpi=_DPI)
     axes = figure.subplots()
     part = file.with_name(f".{file.name}.part{file.suffix}")  # whole under its name, or not at all
-    try:
+    with no_trace(part, file):
         with writer.saving(figure, part, _DPI):
             for t in range(min(len(episode), MOST_STEPS)):
                 _frame(axes, task, episode, t)
                 writer.grab_frame()
         part.replace(file)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _writer(file: Path, speed: int) -> Any:

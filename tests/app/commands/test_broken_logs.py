@@ -7,6 +7,7 @@ import errno
 import os
 import resource
 import shlex
+import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -120,6 +121,21 @@ def test_a_full_disk_stops_the_log_and_is_said_once(
     assert (tmp_path / "a/summary.json").is_file()
     assert part.is_file()
     assert not (tmp_path / "a/episodes.mcap").exists()
+
+
+def test_recovering_to_a_full_disk_is_one_line_and_leaves_nothing(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(writer: EpisodeWriter, episode: Episode) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    file = tmp_path / "a.mcap"
+    shutil.copy(log, file)
+    monkeypatch.setattr(EpisodeWriter, "add", full)
+    assert main(["replay", f"file={file}", "recover=true"]) == 1
+    target = tmp_path / "a.recovered.mcap"
+    assert capsys.readouterr().err == f"trackmdp replay: {target}: No space left on device\n"
+    assert list(tmp_path.iterdir()) == [file]
 
 
 def test_an_evaluation_outlives_its_log(
