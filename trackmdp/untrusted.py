@@ -206,14 +206,19 @@ def load_npz(stream: BinaryIO) -> dict[str, npt.NDArray[Any]]:
         Exception: it is something else, too large, or holds Python objects.
     """
     with zipfile.ZipFile(stream) as archive:
+        members = archive.infolist()
+        # With a wrong bit in the length of a comment, the next entries of the directory are the text of it.
+        if any(member.comment for member in members):
+            raise ValueError("a comment in its directory")
         # A member never unpacks to more than the length in the archive's directory.
-        unpacked = sum(member.file_size for member in archive.infolist())
+        unpacked = sum(member.file_size for member in members)
         if unpacked > (most := min(LARGE, free_bytes() // _COPIES)):
             raise ValueError(f"{unpacked:,} bytes when unpacked, expected at most {most:,}")
-        # Each member is read to its end, where zipfile compares the checksum.
+        # Each member is read to its end, where zipfile compares the checksum. Not by its name: a wrong bit may make it
+        # that of another one.
         return {
-            name.removesuffix(".npy"): load_npy(io.BytesIO(archive.read(name)))
-            for name in archive.namelist()
+            member.filename.removesuffix(".npy"): load_npy(io.BytesIO(archive.read(member)))
+            for member in members
         }
 
 
