@@ -23,6 +23,7 @@ from mcap.writer import Writer
 from tests.episodes.logs import WORLD, recorded, write
 from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged
+from trackmdp.episodes.extracts import write_page
 from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
 from trackmdp.errors import UserError
@@ -122,11 +123,18 @@ CASES: dict[str, Callable[[Parts], Any]] = {
     "index is a number": lambda parts: parts["a"].update({INDEX: 3}),
     "step": lambda parts: parts["x"]["/step"][0][1].update(target="x"),
     "grid": lambda parts: parts["x"]["/grid"][0][1].update(data="!!"),
+    "reward 10^39": lambda parts: parts["x"]["/step"][0][1].update(reward=1e39),
+    "start": lambda parts: parts["a"][INDEX][0].update(start=16),
+    "no start": lambda parts: parts["a"][INDEX][0].update(start=-1),
+    "seed 2^200": lambda parts: parts["a"][INDEX][0].update(seed=str(2**200)),
+    "policy 1": lambda parts: parts["a"][INDEX][0].update(policy=1),
+    "no clip": lambda parts: parts["m"][POLICY].update(memory="displacement"),
 }
 
 
 def read_all(file: Path) -> None:
     with EpisodeReader(file) as reader:
+        write_page(reader, file.with_suffix(".html"))
         found = verify(reader)
         if found.difference is not None:
             raise UserError(found.difference)

@@ -42,6 +42,7 @@ from trackmdp.world.group import Subject
 _BELIEF = np.dtype([("belief", "<f4")])
 _ABOVE, _UPRIGHT = 0.02, {"x": 0, "y": 0, "z": 0, "w": 1}
 _WHITE = {"r": 1, "g": 1, "b": 1, "a": 1}
+_HUGE = np.finfo(np.float32).max
 _FAINT = 0.4
 """Opacity of a target that was missed."""
 
@@ -163,6 +164,9 @@ class Form:
         for t, each in enumerate(said):
             action[t, each["active"]] = True
         start = np.where(start < 0, task.num_cells, start)
+        reward = np.array([each["reward"] for each in said])
+        if np.any(start > task.num_cells - (not targets)) or np.any(abs(reward) > _HUGE):
+            raise ValueError("a start outside of the grid, or a reward out of range")
         modes = np.array([each["mode"] for each in said], dtype=np.int64) if has_mode else None
         return Episode(
             number=row["episode"],
@@ -173,7 +177,7 @@ class Form:
             action=action,
             target=np.where(target < 0, task.num_cells, target),
             located=seen >= 0,
-            reward=np.array([each["reward"] for each in said], dtype=np.float32),
+            reward=reward.astype(np.float32),
             mode=modes,
             first_tick=tick_of(int(row["start_time"])),
             start_mode=row["start_mode"] if has_mode else 0,

@@ -65,7 +65,13 @@ class EpisodeReader:
         self.policies = [self._metadata(f"{schema.POLICY}.{number}") for number in range(count)]
         index = self.attachment("episodes.json", self.end["episodes.json.sha256"])
         self.rows: list[dict[str, Any]] = json.loads(index)
-        self._rows = {row["episode"]: row for row in self.rows}
+        self._rows = {row["episode"]: self._checked(row) for row in self.rows}
+
+    def _checked(self, row: dict[str, Any]) -> dict[str, Any]:
+        """The row, if its policy is in the log and its seed has 63 bits."""
+        if row["policy"] not in range(len(self.policies)) or int(row["seed"]) >> 63:
+            raise Damaged(f"policy or seed of episode {row['episode']}")
+        return row
 
     def __enter__(self) -> EpisodeReader:
         return self
@@ -133,10 +139,10 @@ class EpisodeReader:
         if not tables:
             raise UserError(f"file={self.file}: policy {number} has no table, and cannot act again")
         task = problem.task.remembering()
-        if "memory" in facts:
-            clip, revealed = int(facts["clip"]), int(facts["revealed"])
-            task = task.remembering(facts["memory"], clip=clip, revealed=revealed)
         with reading(self.file):
+            if "memory" in facts:
+                clip, revealed = int(facts["clip"]), int(facts["revealed"])
+                task = task.remembering(facts["memory"], clip=clip, revealed=revealed)
             arrays = [load_npz(io.BytesIO(table)) for table in tables]
             if facts.get("merge") == "joint":
                 cfg = train_config_of(self.attachment(schema.TABLES[0]))
