@@ -128,6 +128,9 @@ CASES: dict[str, Callable[[Parts], Any]] = {
     "no start": lambda parts: parts["a"][INDEX][0].update(start=-1),
     "seed 2^200": lambda parts: parts["a"][INDEX][0].update(seed=str(2**200)),
     "policy 1": lambda parts: parts["a"][INDEX][0].update(policy=1),
+    "policy 0.0": lambda parts: parts["a"][INDEX][0].update(policy=0.0),
+    "return 10^9": lambda parts: parts["a"][INDEX][0].update({"return": 1e9}),
+    "start time": lambda parts: parts["a"][INDEX][0].update(start_time="0"),
     "no clip": lambda parts: parts["m"][POLICY].update(memory="displacement"),
 }
 

@@ -69,7 +69,7 @@ class EpisodeReader:
 
     def _checked(self, row: dict[str, Any]) -> dict[str, Any]:
         """The row, if its policy is in the log and its seed has 63 bits."""
-        if row["policy"] not in range(len(self.policies)) or int(row["seed"]) >> 63:
+        if int(row["seed"]) >> 63 or not self.policies[row["policy"]]:
             raise Damaged(f"policy or seed of episode {row['episode']}")
         return row
 
@@ -113,7 +113,10 @@ class EpisodeReader:
         row = self.row(number)
         with reading(self.file):
             ends = int(row["start_time"]), int(row["end_time"])
-            return self.form.decode(row, self._container.messages_around(*ends))
+            found = self.form.decode(row, self._container.messages_around(*ends))
+            if self.form.row(found, found.first_tick or 0) != row:
+                raise Damaged(f"the figures of episode {number}")
+            return found
 
     def attachment(self, name: str, sha256: str | None = None) -> bytes:
         """An attachment with its digest, by default that of `trackmdp.run`."""
