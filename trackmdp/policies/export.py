@@ -19,6 +19,7 @@ from trackmdp import __version__
 from trackmdp.arrays.types import Array, BoolArray
 from trackmdp.durable import write_bytes
 from trackmdp.errors import UserError, output_of, require
+from trackmdp.machine import check_free
 from trackmdp.policies.forms import adapted
 from trackmdp.policies.geojson import map_features
 from trackmdp.policies.saved import listable
@@ -26,6 +27,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.sensing.task import Task
 
 _LARGEST = 2**31  # entries, a byte each
+_COPIES = 4  # of the table at the least, while a package checks and writes it; onnx makes two more
 
 
 def export(policy: Any, file: str | Path, *, value: Array | None = None, label: str = "") -> Path:
@@ -179,13 +181,14 @@ def _table(policy: PolicyTable) -> BoolArray:
     """`[keys, t_max+2, S]`, the sets and after them the forced safe action.
 
     Raises:
-        UserError: it is too large to be written out.
+        UserError: it is too large to be written out, or for the free memory.
     """
     task = policy.task
     if (size := task.num_keys * (task.num_choices + 1) * task.total_sensors) > _LARGEST:
         raise UserError(
             f"export: a table of {size:,} entries, expected at most {_LARGEST:,}; format=sets takes less"
         )
+    check_free(f"export: a table of {size:,} entries", _COPIES * size)
     sets = policy.dense()
     # Row t_max + 1 is all sensors on: the file's reader then needs no rule for the forced action.
     every = np.broadcast_to(task.available, sets[:, :1].shape)

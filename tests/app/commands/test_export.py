@@ -14,11 +14,14 @@ import torch
 
 import trackmdp as tm
 from tests.training.runs import train
+from trackmdp import machine
 from trackmdp.app.cli import main
 from trackmdp.arrays.types import BoolArray
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import read_sets
+from trackmdp.policies.table import PolicyTable
+from trackmdp.sensing.task import Task
 from trackmdp.training.run import trained
 
 INPUTS = """
@@ -198,3 +201,16 @@ def test_onnx_is_asked_for_by_name(
     monkeypatch.setitem(sys.modules, "onnx", None)
     assert main(["export", f"run={run}", "format=onnx"]) == 2
     assert "format=onnx: needs onnx, which pip install" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("ending", ["onnx", "pt2"])
+def test_a_table_that_does_not_fit_is_refused_before_it_is_made(
+    ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """80 x 80 cells, three rows of 6,400 sensors for each: 123 MB, in memory several times."""
+    task = Task(80, cost=0.1)
+    policy = Policy.from_table(PolicyTable(task, probability=0.0))
+    monkeypatch.setattr(machine, "free_bytes", lambda: 2**28)
+    with pytest.raises(UserError, match=r"122,880,000 entries: needs about 0\.46 GiB"):
+        tm.export(policy, tmp_path / f"policy.{ending}")
+    assert not list(tmp_path.iterdir())
