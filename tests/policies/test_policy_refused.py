@@ -82,6 +82,7 @@ WRONG: dict[str, tuple[Any, str]] = {
         "writes no action",
     ),
     "a number": (3, "a int, expected a Policy"),
+    "a class": (Policy, "the class Policy, expected an object of it"),
     "another world": (
         Policy.all_on(small_world(2, t_max=2)),
         "made for 2 x 2 cells, t_max 2; expected 3 x 3",

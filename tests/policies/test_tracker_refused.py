@@ -113,3 +113,9 @@ def test_sets_beyond_the_budget_are_neither_followed_nor_handed_on(tmp_path: Pat
 def test_the_motion_of_a_group_is_refused() -> None:
     with pytest.raises(UserError, match=r"^tracker: world: expected a World of 3 x 3 cells"):
         begun(world=tm.Group([small_world()] * 2))
+
+
+def test_episodes_are_no_policy_although_they_hold_sensors() -> None:
+    played: Any = tm.simulate(small_world(), "none", 2)
+    with pytest.raises(UserError, match=r"^tracker: a Episodes, expected a policy of one target"):
+        tm.Tracker(played, 3)

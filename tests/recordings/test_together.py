@@ -282,9 +282,11 @@ def test_tracks_of_several_targets_from_a_file(tmp_path: Path) -> None:
     assert len(targets) == 2
     alone = tm.load_tracks(file, 3)
     assert isinstance(alone, Recorded)
-    for wrong in (0, 1001, "x", 1.5):
-        with pytest.raises(UserError, match=r"targets\.count"):
+    for wrong in (0, 1001, "x", 1.5, np.array([1, 2])):
+        with pytest.raises(UserError, match="targets=.*: expected an integer from 1 to 1,?000"):
             tm.load_tracks(file, 3, targets=wrong)  # type: ignore[call-overload]
+        with pytest.raises(UserError, match="targets=.*: expected an integer from 1 to 1,?000"):
+            tm.make_world(targets=wrong)
     with pytest.raises(UserError, match=r"task.memory=displacement: expected cell"):
         tm.load_tracks(file, 3, targets=2, memory="displacement")
     with pytest.raises(UserError, match=r"solver=optimal: needs a motion model"):

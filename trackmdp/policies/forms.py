@@ -89,7 +89,12 @@ def adapted(task: Task | None, policy: Any) -> Any:
     """The policy that an object holds: a `Run`, a `Solution`, a dense table of `task`, a model of Stable-Baselines3.
 
     All other objects are returned as they are.
+
+    Raises:
+        UserError: it is a class.
     """
+    if isinstance(policy, type):
+        raise UserError(f"policy: the class {policy.__name__}, expected an object of it")
     if isinstance(policy, PolicyTable | TensorDictModuleBase):
         return policy
     if task is not None and isinstance(policy, Tensor | np.ndarray):

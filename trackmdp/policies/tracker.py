@@ -235,7 +235,7 @@ def _plan(policy: Plan | str | Path) -> Plan:
         UserError: it is no policy of one target, the file holds none, or it exceeds the budget.
     """
     if not isinstance(policy, str | Path):
-        if not hasattr(policy, "sensors"):
+        if not (hasattr(policy, "sensors") and hasattr(policy, "task")):
             raise UserError(
                 f"tracker: a {type(policy).__name__}, expected a policy of one target, or its file"
             )

@@ -11,9 +11,10 @@ from typing import Any, Literal, cast, overload
 import numpy as np
 import numpy.typing as npt
 
-from trackmdp.arrays.numbers import array_of
+from trackmdp.arrays.numbers import array_of, whole_number
 from trackmdp.config.compose import Default, compose, default, given
 from trackmdp.config.options import GROUPS, options
+from trackmdp.config.several import MOST_TARGETS
 from trackmdp.errors import UserError
 from trackmdp.grid.size import Size, grid_size
 from trackmdp.recordings.tracks import Recorded
@@ -127,6 +128,7 @@ def make_world(
             "takes a table"
         )
     words = given({"kernel": kernel}) | _words(arguments)
+    targets = whole_number("targets", targets, 1, MOST_TARGETS)
     # `compare` has all options of a world, and no solver or learner that could refuse one of them.
     if targets == 1:
         return modelled(make_problem(compose("compare", words)), f"kernel={kernel}")
@@ -179,6 +181,7 @@ def load_tracks(
         raise UserError(
             f"load_tracks: a {type(path).__name__}, expected the path of a file, or a DataFrame"
         )
+    targets = whole_number("targets", targets, 1, MOST_TARGETS)
     source = "DataFrame.parquet" if in_memory else path  # a table of positions
     if isinstance(named := options.get("columns"), Mapping):
         options["columns"] = [f"{ours}:{theirs}" for ours, theirs in named.items()]
