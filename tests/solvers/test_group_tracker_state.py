@@ -67,7 +67,7 @@ def test_a_tracker_of_two_goes_on_from_its_state() -> None:
         ({"task": {}}, "state: made for {}, expected {'size': "),
         (
             {"more": 1},
-            "state: expected a dict with belief, cells, history, misses, on, present, task",
+            "state: expected a dict with belief, cells, history, key, misses, on, present, task",
         ),
     ],
 )

@@ -29,9 +29,15 @@ class TargetsConfig(NodeConfig):
             raise refuse("kernel", root.kernel.name, f"one without modes {with_several}")
         if root.sensor.name == "false_alarm":
             raise refuse("sensor", root.sensor.name, f"perfect, miss or footprint {with_several}")
+        learner: Any = getattr(root, "algo", None)
+        joint = learner is not None and learner.joint
+        # On recorded tracks the union of all targets' own sets needs no prediction.
+        own = (
+            root.task.memory if not (root.kernel.is_motion or joint or root.cost.budget) else "cell"
+        )
         for place, value, expected in (
             ("grid.window", root.grid.window, None),
-            ("task.memory", root.task.memory, "cell"),
+            ("task.memory", root.task.memory, own),
             ("cost.mean_budget", getattr(root.cost, "mean_budget", None), None),
             ("verify", getattr(root, "verify", False), False),
         ):

@@ -18,6 +18,7 @@ from trackmdp.episodes.messages import form_of
 from trackmdp.episodes.schema import time_of
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import packed
+from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.several.merging import Rule
 from trackmdp.untrusted import decoded
 from trackmdp.world.group import Group, Subject
@@ -108,11 +109,13 @@ class EpisodeWriter:
             policy: from which `replay verify=true` simulates them again; None where there is none.
         """
         tables: list[dict[str, Any]] = []
+        plans: Sequence[PolicyTable] = ()
         if isinstance(policy, Rule):
-            facts, tables = {**facts, "merge": policy.name}, policy.packed()
+            facts, tables, plans = {**facts, "merge": policy.name}, policy.packed(), policy.tables
         elif policy is not None:
-            task, tables = policy.task, [packed(policy)]
-            names = ("memory", "clip", "revealed") if task.keyed else ()
+            tables, plans = [packed(policy)], [policy]
+        if plans and (task := plans[0].task).keyed:
+            names = ("memory", "clip", "revealed")
             facts = {**facts, **{name: str(getattr(task, name)) for name in names}}
         return self.copy_policy(facts, list(map(npz_bytes, tables)))
 

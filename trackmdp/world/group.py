@@ -36,7 +36,7 @@ class Group(Carded):
     Args:
         worlds: one for each target, alike but for the motion; the same object where targets move alike.
         recorded: tracks that the targets follow in place of these motions, by which their moves are then predicted
-            alone; see `of_tracks`.
+            alone; see `of_tracks`. A policy of one of them may have a memory, the worlds have none.
 
     Raises:
         UserError: they differ in more than the motion, or have modes, a window or a memory.
@@ -79,7 +79,7 @@ class Group(Carded):
         count = whole_number("Group.of_tracks: count", count, 1, MOST_TARGETS)
         _check_tracks(count, {_HELD_OUT: recorded.held_out})
         kernel = recorded.tracks.kernel(recorded.num_cells)
-        return cls([World.of(recorded, kernel)] * count, recorded)
+        return cls([World.of(recorded, kernel, memory="cell")] * count, recorded)
 
     def __len__(self) -> int:
         return len(self.worlds)

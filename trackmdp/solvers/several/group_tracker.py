@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any, Self
 
 import numpy as np
@@ -79,7 +80,8 @@ class GroupTracker(Following):
         return bool(self._clocks.late(self._policy.task.t_max)[0])
 
     def _facts(self) -> dict[str, Any]:
-        return super()._facts() | {"targets": list(self._group.targets)}
+        keys = asdict(self._policy.keys) | {"size": list(self._task.size)}
+        return super()._facts() | keys | {"targets": list(self._group.targets)}
 
     def _given(self, call: str, cells: Any, at: Any) -> list[int | None]:
         """A cell for each target, which may be given by positions."""
@@ -140,7 +142,7 @@ class GroupTracker(Following):
             self._check_seen("report", int(cell))
         on, moved = np.array(self._on, dtype=np.int64), self._beliefs.moved(self._group)
         states, reports = place + self._first, (present[None], seen[None])
-        clocks, beliefs = followed(self._group, before, moved, on, states[None], reports)
+        clocks, beliefs = followed(self._policy, before, moved, on, states[None], reports)
         lost = np.setdiff1d(np.flatnonzero(present & ~seen), beliefs.row)
         if len(lost) and self._group.recorded is None:  # a track may make moves that no other made
             raise UserError(f"report: target {lost[0]} is missed where it would have been detected")
@@ -155,6 +157,7 @@ class GroupTracker(Following):
             "misses": self.misses,
             "present": self.present,
             "history": None if past is None else np.flatnonzero(past).tolist(),
+            "key": None if self._clocks.key is None else self._clocks.key[0].tolist(),
             "on": self._on,
             "belief": [each.tolist() if each.any() else None for each in self.belief()],
         }
@@ -181,13 +184,21 @@ class GroupTracker(Following):
             steps = _each(state["history"], "state: history")
             on = [whole_number("state: history", each, 0, past.size - 1) for each in steps]
             past.reshape(-1)[np.array(on, np.int64)] = True
+        key = tracker._clocks.key
+        if key is not None:
+            given = _each(state["key"], "state: key", count)
+            last = policy.keys.num_keys - 1
+            key = np.array([[whole_number("state: key", each, 0, last) for each in given]])
+            if (policy.keys.cell(key[0]) != cells).any():
+                raise UserError(f"state: key={given}: expected keys of the cells {cells}")
         mass = np.zeros((count, task.num_cells))
         for number, (here, given) in enumerate(zip(present, beliefs, strict=True)):
             if here and given is not None:
                 mass[number] = probabilities(given, task.num_cells)
         row, cell = np.nonzero(mass)
         tracker._beliefs = Beliefs(row, cell + tracker._first[row], mass[row, cell])
-        tracker._clocks = Clocks(located[None], np.array([missed]), np.array([present]), past)
+        shown = np.array([missed]), np.array([present])
+        tracker._clocks = Clocks(located[None], *shown, past, key)
         tracker._on = tracker._restored(state["on"])
         return tracker
 

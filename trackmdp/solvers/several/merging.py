@@ -45,12 +45,14 @@ class Clocks:
         misses: `[E, K]`, n.
         present: `[E, K]`, whether the target is in the grid.
         history: `[E, t_max + 1, S]`, the sets of the last steps, the latest first, for a rule that `reads_history`.
+        key: `[E, K]`, of each target's plan, where that remembers more than the cell.
     """
 
     located: IndexArray
     misses: IndexArray
     present: BoolArray
     history: BoolArray | None = None
+    key: IndexArray | None = None
 
     def late(self, t_max: int) -> BoolArray:
         """`[E]`, whether the safe action is due."""
@@ -146,6 +148,11 @@ class Rule(ABC):
     reads_history = False
     """Whether it reads the sets of the last steps, in place of beliefs."""
 
+    @property
+    def remembers(self) -> bool:
+        """Whether plans may remember more than the cell; a motion has modes to remember, which groups do not take."""
+        return False
+
     def __init__(self, group: Group, tables: Sequence[PolicyTable]) -> None:
         self.group, self.tables = group, tuple(tables)
         self.task = group.task
@@ -156,10 +163,12 @@ class Rule(ABC):
             )
         for table in tables:
             table.check_fits(self.task)
-            if not table.deterministic or table.task.keyed:
+            if not table.deterministic or (table.task.keyed and not self.remembers):
                 raise UserError(
-                    "policy: expected one that remembers the cell and does not draw, for several targets"
+                    "policy: expected one that remembers the cell and does not draw, for several targets; on recorded "
+                    "tracks targets.merge=union takes one that remembers more"
                 )
+        self.keys = self.tables[0].task.keys if self.tables else self.task.keys
 
     def within(self, group: Group) -> Rule:
         """The same policy for other targets of the same task: the plans of their motions, or all in their order."""
@@ -174,11 +183,22 @@ class Rule(ABC):
         history = np.zeros((len(located), self.task.num_choices, self.sensors), dtype=bool)
         kept = history if self.reads_history else None
         here = np.ones(located.shape, dtype=bool) if present is None else present
-        return Clocks(np.where(here, located, 0), np.zeros_like(located), here, kept)
+        located = np.where(here, located, 0)
+        key = self.keys.start(located) if self.keys.order else None
+        return Clocks(located, np.zeros_like(located), here, kept, key)
+
+    def keys_after(self, clocks: Clocks, state: IndexArray, seen: BoolArray) -> IndexArray | None:
+        """`[E, K]` keys after a step in which the targets `seen` `[E, K]` were located in `state`, or have entered."""
+        if clocks.key is None:
+            return None
+        later = self.keys.next(clocks.key, clocks.misses, state)
+        later = np.where(clocks.present, later, self.keys.start(state))
+        return np.where(seen, later, clocks.key)
 
     def first_sets(self) -> list[sparse.csr_array]:
         """For each kind `[M, S]`, the set of a single target that is located."""
-        return [table.written[:: self.task.num_choices] for table in self.tables]
+        rows = self.keys.start(np.arange(self.cells)) * self.task.num_choices
+        return [table.written[rows] for table in self.tables]
 
     def own_sets(self, seen: Clocks) -> IndexArray:
         """As `sets`, each target's own set, all of them together."""
@@ -186,8 +206,8 @@ class Rule(ABC):
         found = []
         for kind, table in enumerate(self.tables):
             episode, target = np.nonzero(free & (self.group.kind == kind))
-            cell = seen.located[episode, target] - kind * self.cells
-            row = cell * self.task.num_choices + seen.misses[episode, target]
+            key = seen.located - kind * self.cells if seen.key is None else seen.key
+            row = (key * self.task.num_choices + seen.misses)[episode, target]
             on = table.written[row].tocoo()
             found.append(episode[on.row] * self.sensors + on.col)
         return np.unique(np.concatenate(found))
@@ -210,6 +230,11 @@ class Union(Rule):
     """Each target's own set, all of them together."""
 
     name = "union"
+
+    @property
+    def remembers(self) -> bool:
+        """See `Rule`."""
+        return self.group.recorded is not None
 
     def sets(self, seen: Clocks, moved: Beliefs) -> IndexArray:  # noqa: ARG002
         """See `Rule`."""
@@ -292,19 +317,19 @@ def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str | None = N
 
 
 def followed(
-    group: Group, clocks: Clocks, moved: Beliefs, on: IndexArray, place: IndexArray, report: Reports
+    rule: Rule, clocks: Clocks, moved: Beliefs, on: IndexArray, place: IndexArray, report: Reports
 ) -> tuple[Clocks, Beliefs]:
     """Clocks and beliefs after a step.
 
     Args:
-        group: the targets.
+        rule: the policy, and its targets.
         clocks: before the step.
         moved: beliefs after the move.
         on: sorted numbers e · S + j of the sensors j that were on in episode e.
         place: `[E, K]`, states of the targets after the move.
         report: which targets are in the grid, and which were located.
     """
-    task, (present, seen) = group.task, report
+    task, (present, seen) = rule.task, report
     cell, episode = moved.state % task.num_cells, moved.row // present.shape[1]
     late, missed = clocks.late(task.t_max), (present & ~seen).ravel()
     seen_with = report_chance(task, on, episode, cell)
@@ -315,4 +340,5 @@ def followed(
     # A target that has left keeps no clock; one that the safe action missed is due for the next one.
     misses = np.where(present & ~seen, np.minimum(clocks.misses + 1, task.t_max + 1), 0)
     located = np.where(seen, place, clocks.located)
-    return Clocks(located, misses, present, clocks.remembered(on, late)), found
+    history, key = clocks.remembered(on, late), rule.keys_after(clocks, place, seen)
+    return Clocks(located, misses, present, history, key), found

@@ -103,5 +103,5 @@ def group_steps(
         step = GroupStep(row, clocks, moved, on, late, cell, inside, seen)
         going = inside & ~targets.ended()[:, None]
         reports = going, (seen | step.entered) & going
-        clocks, beliefs = followed(rule.group, clocks, moved, on, targets.state, reports)
+        clocks, beliefs = followed(rule, clocks, moved, on, targets.state, reports)
         yield step
