@@ -99,7 +99,7 @@ def test_a_target_that_is_alone_has_the_sets_of_its_plan(seed: int) -> None:
     world = World(kernel, (1, 8), coverage=covers, cost=rng.uniform(0.1, 0.3, 10), t_max=0)
     rule = make_rule(Group([world]), [tm.solve(world).table])
     located = rule.start(np.arange(8)[:, None])
-    sets = rule.sets(located, Beliefs.of(located).moved(rule.group))
+    sets = rule.sets(located, Beliefs.of(rule.group, located).moved(rule.group))
     assert np.array_equal(sets, rule.own_sets(located))
 
 

@@ -27,8 +27,12 @@ from trackmdp.world.model import World
     [
         (["solve", "targets.count=2", "grid.window=2"], "grid.window=2: expected null"),
         (
-            ["solve", "targets.count=2", "kernel=heading"],
-            "kernel=heading: expected one without modes",
+            ["solve", "targets.count=2", "kernel=heading", "kernel.reveals=true"],
+            "kernel.reveals=True: expected false",
+        ),
+        (
+            ["solve", "targets.count=2", "kernel=heading", "cost.budget=2"],
+            "cost.budget=2: expected null with hidden modes",
         ),
         (
             ["evaluate", "baseline=none", "targets.count=2", "sensor=false_alarm"],

@@ -174,7 +174,10 @@ def test_one_targets_plan_is_learned_and_merged(merge: str, tmp_path: Path) -> N
         (["algo=a2c", "targets.merge=union"], "targets.merge=union: without effect with algo=a2c"),
         (["targets.count=1", "targets.merge=union"], "without effect with targets.count=1"),
         (["targets.count=1", "evaluation.width=1"], "without effect with targets.count=1"),
-        (["kernel=heading"], "kernel=heading: expected one without modes"),
+        (
+            ["kernel=heading", "task.memory=displacement", "algo=a2c"],
+            "memory=displacement: expected cell",
+        ),
     ],
 )
 def test_words_without_effect_are_refused(

@@ -25,16 +25,19 @@ class TargetsConfig(NodeConfig):
             return
         # Each of these makes a single target's plan depend on more than its own cell and clock.
         with_several = f"with {key}.count={self.count}"
-        if root.kernel.hides:
-            raise refuse("kernel", root.kernel.name, f"one without modes {with_several}")
+        hides = root.kernel.hides
+        if hides and root.kernel.reveals:
+            raise refuse("kernel.reveals", True, f"false {with_several}")
+        if hides and root.cost.budget is not None:
+            expected = f"null with hidden modes and {key}.count={self.count}"
+            raise refuse("cost.budget", root.cost.budget, expected)
         if root.sensor.name == "false_alarm":
             raise refuse("sensor", root.sensor.name, f"perfect, miss or footprint {with_several}")
         learner: Any = getattr(root, "algo", None)
         joint = learner is not None and learner.joint
-        # On recorded tracks the union of all targets' own sets needs no prediction.
-        own = (
-            root.task.memory if not (root.kernel.is_motion or joint or root.cost.budget) else "cell"
-        )
+        # The union of all targets' own sets, on recorded tracks and with modes, needs no prediction.
+        united = (hides or not root.kernel.is_motion) and not joint and root.cost.budget is None
+        own = root.task.memory if united else "cell"
         for place, value, expected in (
             ("grid.window", root.grid.window, None),
             ("task.memory", root.task.memory, own),

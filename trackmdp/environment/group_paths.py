@@ -31,12 +31,14 @@ class GroupPaths:
         gone: the place of a target that has left.
         waits: whether targets may enter later; until then places are negative.
         offset: `[K]`, the first state of each target's motion.
+        states: of a target.
     """
 
     def __init__(
         self, group: Group, device: torch.device | str = "cpu", *, held_out: bool = False
     ) -> None:
-        recorded, self.cells = group.recorded, group.task.num_cells
+        recorded, self._cells = group.recorded, group.task.num_cells
+        self.states, self._modes = group.states, group.modes
         self.together: Together | None = None
         if recorded is None:
             self.sampler = PathSampler(Motion.of(group.kernel), group.kernel.shape[0], device)
@@ -45,12 +47,12 @@ class GroupPaths:
             tracks = recorded.held_out if held_out else recorded.tracks
             self.together = Together(tracks, len(group))
         self.gone, self.waits = self.sampler.num_states, recorded is not None
-        self.offset = torch.as_tensor(group.kind * self.cells, device=device)
+        self.offset = torch.as_tensor(group.kind * self.states, device=device)
 
     def begin(self, rng: torch.Generator) -> Tensor:
         """`[K]`, places at the start of an episode."""
         if self.together is None:
-            return torch.randint(self.cells, self.offset.shape, generator=rng) + self.offset
+            return torch.randint(self.states, self.offset.shape, generator=rng) + self.offset
         every = self.every()
         return every[int(torch.randint(len(every), (1,), generator=rng))]
 
@@ -72,8 +74,8 @@ class GroupPaths:
     def cell(self, place: Tensor) -> Tensor:
         """`[B, K]`, cells of targets; of no meaning where they are not in the grid."""
         if not self.waits:
-            return place % self.cells
-        return self.sampler.cell(self._flat(place)).view(place.shape).clamp_max(self.cells - 1)
+            return place % self.states // self._modes
+        return self.sampler.cell(self._flat(place)).view(place.shape).clamp_max(self._cells - 1)
 
     def state(self, place: Tensor) -> Tensor:
         """`[B, K]`, states of `Group.kernel`, as `cell`."""
@@ -147,4 +149,4 @@ def group_members(paths: GroupPaths, count: int, missed: bool) -> Targets:
     """The targets of `count` groups that follow `paths`, each at the start in a cell of its own motion."""
     if paths.together is not None:
         return TrackMembers(paths, paths.together, missed)
-    return Targets(paths.sampler, missed, paths.cells, paths.offset.repeat(count))
+    return Targets(paths.sampler, missed, paths.states, paths.offset.repeat(count))

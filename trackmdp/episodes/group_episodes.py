@@ -122,8 +122,8 @@ class _Batch:
 
     def run(self) -> Columns:
         """Columns of `GroupEpisodes`, stepped until the last target has left, or until the last step allowed."""
-        walks, cells = self._walks, self._task.num_cells
-        start = np.where(walks.inside, walks.state % cells, cells).astype(np.int64)
+        walks, cell = self._walks, self._rule.group.cell_of(self._walks.state)
+        start = np.where(walks.inside, cell, self._task.num_cells).astype(np.int64)
         columns, length = joined([self._taken(step) for step in self._steps()])
         return columns | {"start": start, "length": length}
 
@@ -156,8 +156,8 @@ class _Batch:
             moved = step.moved
             episode, target = np.divmod(moved.row, targets)
             place, mass = target + t * targets, moved.mass.astype(np.float32)
-            state = moved.state % cells
-            taken.append({"row": episode, "place": place, "cell": state, "mass": mass})
+            cell = self._rule.group.cell_of(moved.state)
+            taken.append({"row": episode, "place": place, "cell": cell, "mass": mass})
             rows.append(step.row)
         columns, counts = joined(taken)
         lengths = np.bincount(np.concatenate(rows), minlength=episodes).tolist()

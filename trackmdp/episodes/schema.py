@@ -152,8 +152,8 @@ def policy_tables(number: int, facts: Mapping[str, str]) -> dict[str, str]:
 
 
 def modes_of(problem: Subject) -> int:
-    """H; 1 where targets have no modes."""
-    return getattr(problem.single, "modes", 1)
+    """H; 1 where targets have no modes, or there are several, whose modes are not logged."""
+    return 1 if problem.targets else getattr(problem.single, "modes", 1)
 
 
 def shape_of(problem: Subject) -> dict[str, str]:

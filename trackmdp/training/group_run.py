@@ -203,7 +203,7 @@ def beside(
         policies = {} if group.task.budget is not None else fixed_policies(group.task)
         fixed = {name: evaluate(group, policy) for name, policy in policies.items()}
         return found(None, None, fixed)
-    if not cfg.enabled or group.task.max_steps is not None:
+    if not cfg.enabled or group.task.max_steps is not None or group.modes > 1:
         return found(None, None)
     solve = partial(optimal.solve, nodes=cfg.nodes, time_limit=cfg.time_limit)
     singles = tuple(map(solve, group.kinds)) if single is None else (single,)

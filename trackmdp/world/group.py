@@ -11,7 +11,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.arrays.numbers import whole_number
-from trackmdp.arrays.types import Indices
+from trackmdp.arrays.types import IndexArray, Indices
 from trackmdp.config.several import MOST_TARGETS
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, grid_words
@@ -39,7 +39,8 @@ class Group(Carded):
             alone; see `of_tracks`. A policy of one of them may have a memory, the worlds have none.
 
     Raises:
-        UserError: they differ in more than the motion, or have modes, a window or a memory.
+        UserError: they differ in more than the motion, or have a window, modes that a detection reveals or that a
+            budget goes with, or a memory without modes.
     """
 
     worlds: Sequence[World]
@@ -52,9 +53,11 @@ class Group(Carded):
             raise UserError(f"Group: expected a list of 1 to {MOST_TARGETS:,} times a World")
         for number, world in enumerate(worlds):
             of_one = {
-                f"modes={world.modes}": world.modes > 1,
+                f"revealed={world.revealed}": world.revealed > 1,
+                f"budget={world.budget} and modes={world.modes}": world.modes > 1
+                and world.budget is not None,
                 f"grid.window={world.window}": world.window is not None,
-                f"task.memory={world.memory}": world.memory != "cell",
+                f"task.memory={world.memory}": world.memory != "cell" and world.modes == 1,
             }
             if name := next(filter(of_one.get, of_one), ""):
                 raise UserError(f"targets: {name}, expected none with several targets")
@@ -91,8 +94,22 @@ class Group(Carded):
 
     @cached_property
     def task(self) -> Task:
-        """Grid, prices and limits, the same for all targets."""
-        return self.worlds[0].task
+        """Grid, prices and limits, the same for all targets; what a policy remembers is its own."""
+        return self.worlds[0].remembering()
+
+    @property
+    def modes(self) -> int:
+        """H, modes of each target, which are hidden."""
+        return self.worlds[0].modes
+
+    @property
+    def states(self) -> int:
+        """Z = M · H, states of a target."""
+        return self.worlds[0].num_states
+
+    def cell_of(self, state: IndexArray) -> IndexArray:
+        """Cells of states of `kernel`, in their shape."""
+        return state % self.states // self.modes
 
     @property
     def targets(self) -> tuple[int, ...]:
@@ -121,7 +138,7 @@ class Group(Carded):
 
     @cached_property
     def kernel(self) -> sparse.csr_array:
-        """`[Z, Z]` moves of all kinds, one block after the other: state z of kind k is k · M + cell."""
+        """Moves of all kinds, one block `[Z, Z]` after the other: state z of kind k is k · Z + z."""
         return sparse.block_diag([each.kernel for each in self.kinds], "csr")
 
     @property
@@ -136,7 +153,7 @@ class Group(Carded):
 
     @cached_property
     def _steps(self) -> tuple[float, float]:
-        inside = [np.full(world.num_cells, 1.0 / world.num_cells) for world in self.kinds]
+        inside = [np.full(self.states, 1.0 / self.states) for _ in self.kinds]
         arrivals = [world.kernel.T.tocsr() for world in self.kinds]
         total, each, left, taken = 0.0, 0.0, 1.0, 0
         # What is still to come is about `left` times the total.
@@ -258,7 +275,7 @@ def _check_tracks(count: int, parts: Mapping[str, Tracks]) -> None:
 def _alike(one: World, other: World) -> bool:
     """Whether two worlds are the same task."""
     theirs = other.given
-    return all(
+    return one.modes == other.modes and all(
         mine.same_as(theirs[name])
         if isinstance(mine, Coverage)
         else np.array_equal(mine, theirs[name], equal_nan=isinstance(mine, np.ndarray))

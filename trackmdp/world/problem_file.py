@@ -113,11 +113,12 @@ def subject_in(stream: BinaryIO) -> Subject:
 def _group(given: dict[str, Any], members: Indices) -> Group:
     """The group of the arguments of its first world, with the `kernel` of all kinds and the kind of each target."""
     kernel = given.pop("kernel")
-    cells, kinds = math.prod(given["size"]), len(np.unique(members))
-    if members.ndim != 1 or kernel.shape[0] != kinds * cells or members.max() != kinds - 1:
+    states = math.prod(given["size"]) * given.get("modes", 1)
+    kinds = len(np.unique(members))
+    if members.ndim != 1 or kernel.shape[0] != kinds * states or members.max() != kinds - 1:
         raise ValueError(f"kinds {members.shape} of {kernel.shape[0]} states")
     # A target keeps its motion, so that all moves are in the blocks on the diagonal.
-    blocks = [slice(kind * cells, (kind + 1) * cells) for kind in range(kinds)]
+    blocks = [slice(kind * states, (kind + 1) * states) for kind in range(kinds)]
     worlds = [World(kernel[block][:, block], **given) for block in blocks]
     return Group([worlds[kind] for kind in members])
 

@@ -35,7 +35,8 @@ def upper_bound(group: Group) -> float:
         return math.nan
     equal = equal_shares(group)
     task = group.task
-    apart = task.budget is None and task.coverage is None  # sensors are decided on one by one
+    # Sensors are decided on one by one, and states are cells.
+    apart = task.budget is None and task.coverage is None and group.modes == 1
     if len(group) != 2 or task.num_cells**2 > MOST_PAIRS or not apart:
         return equal
     one, other = group.worlds

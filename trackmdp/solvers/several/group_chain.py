@@ -21,7 +21,7 @@ MOST_STATES = 2_000
 """Joint states up to which a policy is valued exactly: a second or two."""
 
 Known: TypeAlias = tuple[int, int, tuple[tuple[int, float], ...]]
-"""A target in the grid: state of the last detection, misses since, and its belief as pairs of state and mass."""
+"""A target in the grid: cell of the last detection, misses since, and its belief as pairs of state and mass."""
 Joint: TypeAlias = tuple[Known | None, ...]
 """What is known of every target; None of one that has left."""
 Outcome: TypeAlias = tuple[float, bool, Known | None]
@@ -34,7 +34,8 @@ def joint_chain(rule: Rule) -> Array | None:
     None where there are more joint states, or the policy remembers more than beliefs.
     """
     group = rule.group
-    if group.task.num_cells ** len(group) > MOST_STATES or rule.reads_history:
+    many = group.task.num_cells ** len(group) > MOST_STATES
+    if many or rule.keys.order or rule.reads_history:
         return None
 
     def choices(joint: Joint) -> list[IndexArray]:
@@ -69,8 +70,11 @@ def explored(
         choices: sets of sensors, of which each is followed.
         most: states.
     """
-    cells, kinds = group.task.num_cells, group.kind
-    starts = itertools.product(*(range(kind * cells, (kind + 1) * cells) for kind in kinds))
+    cells, modes = range(group.task.num_cells), range(group.modes)
+
+    def located(kind: int, cell: int) -> Known:
+        first = kind * group.states + cell * group.modes
+        return cell, 0, tuple((first + mode, 1.0 / group.modes) for mode in modes)
 
     def followed(joint: Joint) -> Iterator[tuple[Array, dict[Joint, float]]]:
         forced = any(each and each[1] > group.task.t_max for each in joint)
@@ -82,7 +86,8 @@ def explored(
                     moves[after] += chance
             yield total, moves
 
-    return reached([tuple((z, 0, ((z, 1.0),)) for z in each) for each in starts], followed, most)
+    each = [[located(kind, cell) for cell in cells] for kind in group.targets]
+    return reached(list(itertools.product(*each)), followed, most)
 
 
 def _steps(
@@ -107,19 +112,22 @@ def _outcomes(group: Group, known: Known, on: IndexArray, forced: bool) -> list[
     task, (located, misses, belief) = group.task, known
     states, masses = (np.array(part) for part in zip(*belief, strict=True))
     moved = Beliefs(np.zeros(len(states), np.int64), states, masses).moved(group)
-    cells = moved.state % task.num_cells
+    cells = group.cell_of(moved.state)
     sees = task.safe_detection[cells] if forced else report_chance(task, on, 0 * cells, cells)
-    found: list[Outcome] = [
-        (float(p), True, (int(z), 0, ((int(z), 1.0),)))
-        for p, z in zip(moved.mass * sees, moved.state, strict=True)
-        if p > 0
-    ]
-    left = moved.mass * (1.0 - sees)
-    if (total := float(left.sum())) > 1e-15:
-        # Rounded, so that the same belief reached in two ways is one state.
-        pairs = [
-            (int(z), round(p / total, 12)) for z, p in zip(moved.state, left, strict=True) if p > 0
-        ]
-        found.append((total, False, (located, min(misses + 1, task.t_max + 1), tuple(pairs))))
+    found: list[Outcome] = []
+    for cell in np.unique(cells).tolist():
+        here = cells == cell
+        total, known_there = _normal(moved.state[here], moved.mass[here] * sees[here])
+        if total > 0:
+            found.append((total, True, (cell, 0, known_there)))
+    total, left = _normal(moved.state, moved.mass * (1.0 - sees))
+    if total > 1e-15:
+        found.append((total, False, (located, min(misses + 1, task.t_max + 1), left)))
     gone = 1.0 - float(moved.mass.sum())
     return [*found, (gone, False, None)] if gone > 1e-15 else found
+
+
+def _normal(states: IndexArray, mass: Array) -> tuple[float, tuple[tuple[int, float], ...]]:
+    """The sum of the masses, and the belief: rounded, so that the same one reached in two ways is one state."""
+    total, pairs = float(mass.sum()), zip(states.tolist(), mass.tolist(), strict=True)
+    return total, tuple((z, round(p / total, 12)) for z, p in pairs if p > 0)

@@ -10,7 +10,7 @@ from trackmdp.notebook.card import Card, Carded, decimal, grid_words
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.several.group_bounds import sensors_suffice
 from trackmdp.solvers.several.group_tracker import GroupTracker
-from trackmdp.solvers.several.merging import Merged
+from trackmdp.solvers.several.merging import Rule, make_rule
 from trackmdp.solvers.solution import Solution
 from trackmdp.solvers.value import price_at_exit
 from trackmdp.world.group import Group
@@ -38,9 +38,9 @@ class GroupSolution(Carded):
         return tuple(each.table for each in self.singles)
 
     @cached_property
-    def policy(self) -> Merged:
-        """The policy that adds up the gains of all targets."""
-        return Merged(self.group, self.tables)
+    def policy(self) -> Rule:
+        """The policy that adds up the gains of all targets; with hidden modes the union of their sets."""
+        return make_rule(self.group, self.tables)
 
     def tracker(
         self,
@@ -62,11 +62,11 @@ class GroupSolution(Carded):
 
         All own sets together cost no more than apart, but for a target's exit step, paid where others are left; and a
         detection more loses nothing where all sensors can do what the safe action does, and are no dearer. None where
-        they are or cannot, a budget forbids the union, or a safe action that misses may take the place of sets that
-        would not.
+        they are or cannot, a budget forbids the union, a safe action that misses may take the place of sets that would
+        not, or modes are hidden.
         """
         task = self.group.task
-        if not (sensors_suffice(task) and task.safe):
+        if self.group.modes > 1 or not (sensors_suffice(task) and task.safe):
             return None
         kinds = zip(self.group.kinds, self.tables, strict=True)
         exits = [price_at_exit(*each) if len(self.group) > 1 else 0.0 for each in kinds]

@@ -49,11 +49,10 @@ class GroupTracker(Following):
                 f"tracker: a {type(policy).__name__}, expected a policy of several targets"
             )
         self._policy, self._group, self._task = policy, policy.group, policy.task
-        self._first = self._group.kind * self._task.num_cells  # `[K]`, states of cell 0
+        self._first = self._group.kind * self._group.states  # `[K]`, the first states
         found = self._given("tracker", cells, at)
-        located = np.array([self._cell("tracker", cell) for cell in found]) + self._first
-        self._clocks = policy.start(located[None])
-        self._beliefs = Beliefs.at(np.arange(len(self._group)), located)
+        self._clocks = policy.start(np.array([[self._cell("tracker", cell) for cell in found]]))
+        self._beliefs = Beliefs.of(self._group, self._clocks)
 
     def __repr__(self) -> str:
         return f"GroupTracker(cells={self.cells}, misses={self.misses}, safe={self.safe})"
@@ -61,7 +60,7 @@ class GroupTracker(Following):
     @property
     def cells(self) -> list[int | None]:
         """The cell of each target's last detection; None where it has left."""
-        cells = (self._clocks.located[0] - self._first).tolist()
+        cells = self._clocks.located[0].tolist()
         return [cell if here else None for cell, here in zip(cells, self.present, strict=True)]
 
     @property
@@ -104,7 +103,11 @@ class GroupTracker(Following):
 
     def belief(self) -> Array:
         """`[K, M]` probability of each cell now, after the last report; 0 where the target has left."""
-        found = np.zeros((len(self._group), self._task.num_cells))
+        return self._masses().reshape(len(self._group), self._task.num_cells, -1).sum(axis=2)
+
+    def _masses(self) -> Array:
+        """`[K, Z]`, of each state."""
+        found = np.zeros((len(self._group), self._group.states))
         row, state = self._beliefs.row, self._beliefs.state
         found[row, state - self._first[row]] = self._beliefs.mass
         return found
@@ -141,8 +144,8 @@ class GroupTracker(Following):
         for cell in place[seen]:
             self._check_seen("report", int(cell))
         on, moved = np.array(self._on, dtype=np.int64), self._beliefs.moved(self._group)
-        states, reports = place + self._first, (present[None], seen[None])
-        clocks, beliefs = followed(self._policy, before, moved, on, states[None], reports)
+        reports = present[None], seen[None]
+        clocks, beliefs = followed(self._policy, before, moved, on, place[None], reports)
         lost = np.setdiff1d(np.flatnonzero(present & ~seen), beliefs.row)
         if len(lost) and self._group.recorded is None:  # a track may make moves that no other made
             raise UserError(f"report: target {lost[0]} is missed where it would have been detected")
@@ -153,13 +156,13 @@ class GroupTracker(Following):
         past = self._clocks.history
         return {
             "task": self._facts(),
-            "cells": (self._clocks.located[0] - self._first).tolist(),
+            "cells": self._clocks.located[0].tolist(),
             "misses": self.misses,
             "present": self.present,
             "history": None if past is None else np.flatnonzero(past).tolist(),
             "key": None if self._clocks.key is None else self._clocks.key[0].tolist(),
             "on": self._on,
-            "belief": [each.tolist() if each.any() else None for each in self.belief()],
+            "belief": [each.tolist() if each.any() else None for each in self._masses()],
         }
 
     @classmethod
@@ -178,7 +181,7 @@ class GroupTracker(Following):
         )
         if not all(isinstance(here, bool) for here in present):
             raise UserError("state: expected True or False as present")
-        located = np.array([tracker._cell("state", cell) for cell in cells]) + tracker._first
+        located = np.array([[tracker._cell("state", cell) for cell in cells]])
         missed = [whole_number("state: misses", n, 0, task.num_choices) for n in misses]
         if past is not None:
             steps = _each(state["history"], "state: history")
@@ -191,14 +194,14 @@ class GroupTracker(Following):
             key = np.array([[whole_number("state: key", each, 0, last) for each in given]])
             if (policy.keys.cell(key[0]) != cells).any():
                 raise UserError(f"state: key={given}: expected keys of the cells {cells}")
-        mass = np.zeros((count, task.num_cells))
+        mass = np.zeros((count, policy.group.states))
         for number, (here, given) in enumerate(zip(present, beliefs, strict=True)):
             if here and given is not None:
-                mass[number] = probabilities(given, task.num_cells)
-        row, cell = np.nonzero(mass)
-        tracker._beliefs = Beliefs(row, cell + tracker._first[row], mass[row, cell])
+                mass[number] = probabilities(given, policy.group.states)
+        row, place = np.nonzero(mass)
+        tracker._beliefs = Beliefs(row, place + tracker._first[row], mass[row, place])
         shown = np.array([missed]), np.array([present])
-        tracker._clocks = Clocks(located[None], *shown, past, key)
+        tracker._clocks = Clocks(located, *shown, past, key)
         tracker._on = tracker._restored(state["on"])
         return tracker
 

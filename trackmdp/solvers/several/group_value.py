@@ -92,21 +92,24 @@ def simulated(rule: Rule, episodes: int, seed: int, name: str) -> Array:
 
 
 def known_rewards(rule: Rule) -> list[Array]:
-    """For each kind `[M]`, the reward of the first set of a single target in each cell."""
+    """For each kind `[M]`, the reward of the first set of a single target in each cell, a mean over its modes."""
     rewards = []
     for world, sets in zip(rule.group.kinds, rule.first_sets(), strict=True):
-        first = sets.astype(np.float64)
-        on, (row, cell) = first.tocoo(), (row_index(world.kernel), world.kernel.indices)
-        chance = report_chance(world, np.sort(on.row * world.total_sensors + on.col), row, cell)
-        seen = per_row(row, world.kernel.data * chance, world.num_cells)
-        rewards.append(world.reward * seen - (first @ world.paid) * world.stay_probability)
+        cells, row = world.motion.cell, row_index(world.kernel)
+        on = sets[cells].astype(np.float64).tocoo()
+        codes = np.sort(on.row.astype(np.int64) * world.total_sensors + on.col)
+        chance = report_chance(world, codes, row, cells[world.kernel.indices])
+        seen = per_row(row, world.kernel.data * chance, world.num_states)
+        reward = world.reward * seen - (on @ world.paid) * world.stay_probability
+        rewards.append(reward.reshape(world.num_cells, -1).mean(axis=1))
     return rewards
 
 
 def known_mean(rule: Rule) -> float:
     """The mean over episodes of the sum of `known_rewards` of all targets."""
     means = []
-    for world, reward in zip(rule.group.kinds, known_rewards(rule), strict=True):
+    for world, of_cell in zip(rule.group.kinds, known_rewards(rule), strict=True):
+        reward = of_cell[world.motion.cell]
         if world.max_steps is None:
             total = accumulate(world.kernel, reward, grid_of(world))
         else:
@@ -125,9 +128,9 @@ class _Drawn:
         self._kernel, self._rng = group.kernel, rng
         # Sums of all rows, one after the other: the first of row z is at `sums[indptr[z]]`.
         self._sums = np.concatenate([[0.0], np.cumsum(self._kernel.data)])
-        cells, shape = group.task.num_cells, (episodes, len(group))
-        cell = np.random.default_rng(rng.integers(2**63)).integers(cells, size=shape)
-        self.state, self.inside = cell + group.kind * cells, np.ones(shape, dtype=bool)
+        states, shape = group.states, (episodes, len(group))
+        own = np.random.default_rng(rng.integers(2**63)).integers(states, size=shape)
+        self.state, self.inside = own + group.kind * states, np.ones(shape, dtype=bool)
 
     def move(self, row: IndexArray, step: int) -> None:  # noqa: ARG002
         """See `Moving`; every draw is made in every step."""
@@ -156,8 +159,8 @@ def _totals(rule: Rule, targets: Moving, seed: int) -> Array:
     """`[E, 7]` totals of episodes stepped together, as in `GroupEvaluation`."""
     task, shape = rule.task, targets.state.shape
     rng = np.random.default_rng(derive(seed, "reports"))
-    found, known = np.zeros((shape[0], 7)), np.concatenate(known_rewards(rule))
-    place = targets.state
+    found, known, kind = np.zeros((shape[0], 7)), np.stack(known_rewards(rule)), rule.group.kind
+    cell = rule.group.cell_of(targets.state)
     for step in group_steps(rule, targets, lambda *_: rng.random(shape), predicted=False):
         before, present, detections = step.before.present, step.present, step.seen.sum(axis=1)
         some, (episode, sensor) = present.any(axis=1), np.divmod(step.on, rule.sensors)
@@ -169,8 +172,8 @@ def _totals(rule: Rule, targets: Moving, seed: int) -> Array:
             np.bincount(episode, minlength=shape[0]) * some,
             step.late & some,
             before.any(axis=1),
-            (known[place] * before).sum(axis=1),
+            (known[kind, cell] * before).sum(axis=1),
         )
         found += np.stack(columns, axis=1)
-        place = targets.state
+        cell = step.cell
     return found

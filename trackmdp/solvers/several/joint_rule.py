@@ -59,7 +59,7 @@ class JointRule(Rule):
         found = []
         for kind in range(len(self.group.kinds)):
             alone = np.arange(len(self.group)) == self.group.targets.index(kind)
-            start = self.start(np.arange(self.cells)[:, None] + self.group.kind * self.cells)
+            start = self.start(np.repeat(np.arange(self.cells)[:, None], len(self.group), axis=1))
             shown = Clocks(start.located, start.misses, start.present & alone, start.history)
             found.append(sparse.csr_array(self._chosen(shown)))
         return found
@@ -67,13 +67,16 @@ class JointRule(Rule):
     @torch.no_grad()
     def _chosen(self, seen: Clocks) -> BoolArray:
         """`[E, S]`."""
-        cell = seen.located - self.group.kind * self.cells
         # A target that has left has no clock.
         misses = np.where(seen.present, seen.misses, 0)
-        parts = {"last_cell": cell, "steps_since_detection": misses, "present": seen.present}
+        parts = {
+            "last_cell": seen.located,
+            "steps_since_detection": misses,
+            "present": seen.present,
+        }
         rows = {name: torch.as_tensor(part) for name, part in parts.items()}
         rows["action_history"] = torch.as_tensor(seen.history)
-        state = TensorDict(rows, len(cell)).to(self._device)
+        state = TensorDict(rows, len(misses)).to(self._device)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             action = self.actor(state)["action"].cpu().numpy()
         return action & self.task.available

@@ -41,7 +41,7 @@ class Clocks:
     """What the tracker is shown of E episodes; the other parts of a target that has left count for nothing.
 
     Attributes:
-        located: `[E, K]`, state of the last detection.
+        located: `[E, K]`, cell of the last detection.
         misses: `[E, K]`, n.
         present: `[E, K]`, whether the target is in the grid.
         history: `[E, t_max + 1, S]`, the sets of the last steps, the latest first, for a rule that `reads_history`.
@@ -95,10 +95,26 @@ class Beliefs:
         return cls.at(*np.zeros((2, 0), dtype=np.int64))
 
     @classmethod
-    def of(cls, clocks: Clocks) -> Beliefs:
-        """At the start, where the targets that are there are located."""
-        rows = np.flatnonzero(clocks.present)
-        return cls.at(rows, clocks.located.ravel()[rows])
+    def of(cls, group: Group, clocks: Clocks) -> Beliefs:
+        """At the start, where the targets that are there are located, in any of their modes alike."""
+        rows, modes = np.flatnonzero(clocks.present), group.modes
+        first = group.kind[rows % len(group)] * group.states + clocks.located.ravel()[rows] * modes
+        states = (first[:, None] + np.arange(modes)).ravel()
+        return cls(np.repeat(rows, modes), states, np.full(len(states), 1.0 / modes))
+
+    def seen(self, group: Group, rows: IndexArray, cells: IndexArray) -> Beliefs:
+        """The targets `rows` of a step's `moved` beliefs, located in `cells`.
+
+        What is known of their modes is kept. A recorded track may move as no other did.
+        """
+        if group.modes == 1:
+            return Beliefs.at(rows, group.kind[rows % len(group)] * group.states + cells)
+        place = among(rows, self.row)
+        here = np.flatnonzero(place[1])
+        here = here[group.cell_of(self.state[here]) == cells[place[0][here]]]
+        row, mass = self.row[here], self.mass[here]
+        total = per_row(row, mass, int(row.max(initial=-1)) + 1)
+        return Beliefs(row, self.state[here], mass / total[row])
 
     def moved(self, group: Group) -> Beliefs:
         """After a move; masses of a row then sum to the probability that its target is in the grid."""
@@ -150,7 +166,7 @@ class Rule(ABC):
 
     @property
     def remembers(self) -> bool:
-        """Whether plans may remember more than the cell; a motion has modes to remember, which groups do not take."""
+        """Whether plans may remember more than the cell."""
         return False
 
     def __init__(self, group: Group, tables: Sequence[PolicyTable]) -> None:
@@ -179,7 +195,7 @@ class Rule(ABC):
         return type(self)(group, [known[kind] for kind in kinds])
 
     def start(self, located: IndexArray, present: BoolArray | None = None) -> Clocks:
-        """Targets of E episodes located in the states `[E, K]`: all, or those that are `present` `[E, K]`."""
+        """Targets of E episodes located in the cells `[E, K]`: all, or those that are `present` `[E, K]`."""
         history = np.zeros((len(located), self.task.num_choices, self.sensors), dtype=bool)
         kept = history if self.reads_history else None
         here = np.ones(located.shape, dtype=bool) if present is None else present
@@ -206,7 +222,7 @@ class Rule(ABC):
         found = []
         for kind, table in enumerate(self.tables):
             episode, target = np.nonzero(free & (self.group.kind == kind))
-            key = seen.located - kind * self.cells if seen.key is None else seen.key
+            key = seen.located if seen.key is None else seen.key
             row = (key * self.task.num_choices + seen.misses)[episode, target]
             on = table.written[row].tocoo()
             found.append(episode[on.row] * self.sensors + on.col)
@@ -234,7 +250,7 @@ class Union(Rule):
     @property
     def remembers(self) -> bool:
         """See `Rule`."""
-        return self.group.recorded is not None
+        return self.group.recorded is not None or self.group.modes > 1
 
     def sets(self, seen: Clocks, moved: Beliefs) -> IndexArray:  # noqa: ARG002
         """See `Rule`."""
@@ -287,7 +303,8 @@ class Merged(Rule):
         free = (seen.misses <= self.task.t_max).ravel()[moved.row]
         row, state = moved.row[free], moved.state[free]
         located, misses = seen.located.ravel()[row], seen.misses.ravel()[row]
-        cell, episode = state % self.cells, row // targets
+        located = located + self.group.kind[row % targets] * self.cells
+        cell, episode = self.group.cell_of(state), row // targets
         gain = moved.mass[free] * self.credit(located, misses, state)
         inside = per_row(moved.row, moved.mass, episodes * targets)
         gone = 1.0 - inside.reshape(episodes, targets)
@@ -302,15 +319,17 @@ class Merged(Rule):
 def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str | None = None) -> Rule:
     """The policy for several targets that single ones make, merged by `gains`, or their plain `union`.
 
-    None: by gains, but on recorded tracks, of which the moves pooled by cell say too little, the union. A budget needs
-    gains.
+    None: by gains, but the union on recorded tracks, of which the moves pooled by cell say too little, and with hidden
+    modes, where a plan's worth is no sum over cells. A budget needs gains.
     """
     kinds = {"gains": Merged, "union": Union}
     if merge is None:
-        known = group.recorded is None or group.task.budget is not None
-        merge = "gains" if known else "union"
+        known = group.recorded is None and group.modes == 1
+        merge = "gains" if known or group.task.budget is not None else "union"
     if merge not in kinds:
         raise UserError(f"merge={merge}: expected gains or union")
+    if merge == "gains" and group.modes > 1:
+        raise UserError("targets.merge=gains: expected union with hidden modes")
     if merge == "union" and (budget := group.task.budget) is not None:
         raise UserError(f"targets.merge=union: expected gains with a budget, {budget}")
     return kinds[merge](group, tables)
@@ -326,17 +345,17 @@ def followed(
         clocks: before the step.
         moved: beliefs after the move.
         on: sorted numbers e · S + j of the sensors j that were on in episode e.
-        place: `[E, K]`, states of the targets after the move.
+        place: `[E, K]`, cells of the targets after the move.
         report: which targets are in the grid, and which were located.
     """
     task, (present, seen) = rule.task, report
-    cell, episode = moved.state % task.num_cells, moved.row // present.shape[1]
+    cell, episode = rule.group.cell_of(moved.state), moved.row // present.shape[1]
     late, missed = clocks.late(task.t_max), (present & ~seen).ravel()
     seen_with = report_chance(task, on, episode, cell)
     chance = np.where(late[episode], task.safe_detection[cell], seen_with)
     left = moved.given(missed, chance, missed.size)
     again = np.flatnonzero(seen.ravel())
-    found = left.joined(Beliefs.at(again, place.ravel()[again]))
+    found = left.joined(moved.seen(rule.group, again, place.ravel()[again]))
     # A target that has left keeps no clock; one that the safe action missed is due for the next one.
     misses = np.where(present & ~seen, np.minimum(clocks.misses + 1, task.t_max + 1), 0)
     located = np.where(seen, place, clocks.located)

@@ -82,20 +82,20 @@ def group_steps(
         draws: of the reports; asked for where sensors or the safe action may miss.
         predicted: whether beliefs are wanted where the policy does not read them.
     """
-    task, cells, sensors = rule.task, rule.cells, rule.sensors
-    clocks, sure = rule.start(targets.state, targets.inside), task.perfect and task.safe
-    beliefs = Beliefs.of(clocks)
-    episode = np.repeat(np.arange(len(targets.state)), len(rule.group))
+    task, group, sensors = rule.task, rule.group, rule.sensors
+    clocks = rule.start(group.cell_of(targets.state), targets.inside)
+    beliefs, sure = Beliefs.of(group, clocks), task.perfect and task.safe
+    episode = np.repeat(np.arange(len(targets.state)), len(group))
     for number in itertools.count() if task.max_steps is None else range(task.max_steps):
         if not len(row := np.flatnonzero(clocks.present.any(axis=1))):
             return
-        moved = beliefs.moved(rule.group) if predicted or not rule.reads_history else Beliefs.none()
+        moved = beliefs.moved(group) if predicted or not rule.reads_history else Beliefs.none()
         late = clocks.late(task.t_max)
         on = rule.sets(clocks, moved)
         on = on[~late[on // sensors]]
         targets.move(row, number)
         inside = targets.inside
-        cell = np.where(inside, targets.state % cells, 0)
+        cell = np.where(inside, group.cell_of(targets.state), 0)
         chance = report_chance(task, on, episode, cell.ravel()).reshape(cell.shape)
         chance = np.where(late[:, None], task.safe_detection[cell], chance)
         report = chance > 0 if sure else draws(row, number) < chance
@@ -103,5 +103,5 @@ def group_steps(
         step = GroupStep(row, clocks, moved, on, late, cell, inside, seen)
         going = inside & ~targets.ended()[:, None]
         reports = going, (seen | step.entered) & going
-        clocks, beliefs = followed(rule, clocks, moved, on, targets.state, reports)
+        clocks, beliefs = followed(rule, clocks, moved, on, cell, reports)
         yield step

@@ -1,0 +1,158 @@
+"""Several targets with hidden modes: the union of plans over keys, against brute force, and the same in every part."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import trackmdp as tm
+from tests.solvers.test_group import best_of_all
+from trackmdp.environment.group_dynamics import GroupDynamics
+from trackmdp.environment.group_paths import GroupPaths
+from trackmdp.episodes.reader import EpisodeReader, verify
+from trackmdp.episodes.writer import EpisodeWriter
+from trackmdp.errors import UserError
+from trackmdp.policies.table import PolicyTable
+from trackmdp.seeding import derive
+from trackmdp.solvers.evaluate import evaluate, group_rule
+from trackmdp.solvers.several.group_bounds import upper_bound
+from trackmdp.solvers.several.group_tracker import GroupTracker
+from trackmdp.solvers.several.group_value import evaluate_group
+from trackmdp.world.group import Group
+from trackmdp.world.model import World
+from trackmdp.world.problem_file import problem_bytes, problem_digest, read_problem
+
+
+def ring(turn: float, leave: float = 0.25, **more: Any) -> World:
+    """Three cells in a ring: a target goes on to the next one, or turns and goes to the other; moves tell its mode."""
+    kernel = np.zeros((6, 6))
+    for cell in range(3):
+        for mode, step in enumerate((1, 2)):
+            for after, chance in ((mode, 1 - turn), (1 - mode, turn)):
+                to = (cell + (step if after == mode else 3 - step)) % 3
+                kernel[cell * 2 + mode, to * 2 + after] = chance * (1 - leave)
+    return World(kernel, (1, 3), modes=2, **{"cost": 0.3, "safe_cost": 1.0, "t_max": 1} | more)
+
+
+def random_table(world: World, seed: int) -> PolicyTable:
+    shape = world.num_keys, world.num_choices, world.total_sensors
+    return PolicyTable.from_dense(world, np.random.default_rng(seed).random(shape) < 0.5)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [{}, {"detection": 0.8, "t_max": 0}, {"safe_cost": 0.4, "max_steps": 5, "t_max": 0}],
+)
+def test_brute_force_lies_between_the_policies_and_the_bound(more: dict[str, Any]) -> None:
+    """Where targets never turn there are few beliefs: at the first detection after the start the mode is known."""
+    world = ring(0.0, **more)
+    group = Group([world, World.of(world, ring(0.0, 0.5).kernel, modes=2, revealed=1)])
+    best = best_of_all(group)
+    assert best <= upper_bound(group) + 1e-9
+    for seed in range(3):
+        rule = group_rule(group, random_table(world, seed))
+        exact, played = evaluate_group(rule), evaluate_group(rule, episodes=3_000)
+        assert exact.exact
+        assert exact.aihtr.mean <= best + 1e-9
+        assert played.aihtr.low is not None
+        half = played.aihtr.mean - played.aihtr.low
+        assert abs(played.aihtr.mean - exact.aihtr.mean) < 2 * half + 1e-9
+
+
+@pytest.mark.parametrize(("turn", "memory"), [(0.0, "cell"), (0.2, "cell"), (0.2, "displacement")])
+def test_one_target_is_todays_world(turn: float, memory: str) -> None:
+    world = ring(turn, memory=memory, clip=1, detection=0.8)
+    for seed in range(4):
+        table = random_table(world, seed)
+        alone, found = evaluate(world, table).aihtr, evaluate(Group([world]), table, width=0.02)
+        if turn == 0:
+            assert found.aihtr.mean == pytest.approx(alone, abs=1e-9)
+        else:
+            assert found.aihtr.low is not None
+            half = found.aihtr.mean - found.aihtr.low
+            assert abs(found.aihtr.mean - alone) < 2 * half
+
+
+def test_environment_simulation_tracker_and_log_agree(tmp_path: Path) -> None:
+    """And beliefs are those of a filter over states, written out."""
+    world = ring(0.2, 0.1, memory="displacement", clip=1, detection=0.7, safe_detection=0.8)
+    group = Group([world, World.of(world, ring(0.5, 0.2).kernel, modes=2, revealed=1)])
+    rule = group_rule(group, tm.Policy.from_table(random_table(world, 1)))
+    assert rule.name == "union"
+    paths, kernels = GroupPaths(group), [each.kernel.toarray() for each in group.worlds]
+    dynamics, episodes, found = GroupDynamics(group.task, paths, 2), tm.simulate(group, rule, 15), 0
+    for episode in episodes:
+        moves, reports = (
+            torch.Generator().manual_seed(seed)
+            for seed in (episode.seed, derive(episode.seed, "report"))
+        )
+        state, tracker = dynamics.start(paths.begin(moves)), GroupTracker(rule, episode.start)
+        drawn = paths.sampler.draw(256 * 2, moves).view(-1, 2)
+        seen = torch.rand(256, 2, dtype=torch.float64, generator=reports)
+        beliefs = [np.repeat(np.eye(3)[cell], 2) / 2 for cell in episode.start]
+        for t, step in enumerate(episode.to_tensordict(group.task)):
+            on, safe = tracker.sensors(), tracker.safe
+            assert safe or on == step["action"].nonzero().flatten().tolist()
+            state = dynamics.advance(state, step["action"][None], drawn[t], seen[t])
+            for key, expected in step["next"].items():
+                assert torch.equal(state[key][0], expected), key
+            shown, gone = list[int | None](), episode.target[t] == 3
+            chance = np.where(safe, 0.8, 0.7 * step["action"].numpy()).repeat(2)
+            for k, cell in enumerate(episode.target[t].tolist()):
+                hit = bool(episode.located[t, k])
+                shown.append(cell if hit else None)
+                likely = np.repeat(np.eye(3)[cell], 2) if hit else 1 - chance
+                after = beliefs[k] @ kernels[k] * (0 * chance if gone[k] else likely)
+                beliefs[k] = after / max(after.sum(), 1e-300)
+                found += hit
+            tracker.report(shown, gone=np.flatnonzero(gone).tolist())
+            tracker = GroupTracker.restore(rule, tracker.state())
+            expected = np.stack(beliefs).reshape(2, 3, 2).sum(axis=2)
+            np.testing.assert_allclose(tracker.belief(), expected, atol=1e-12)
+    assert found > 50
+    writer = EpisodeWriter.of(tmp_path / "a.mcap", group, facts={"seed": "0"}, config="{}")
+    writer.add_policy({"label": "mine"}, rule)
+    for each in episodes.complete():
+        writer.add(each)
+    with EpisodeReader(writer.finish()) as reader:
+        assert verify(reader).difference is None
+
+
+def test_a_group_is_the_same_from_its_file(tmp_path: Path) -> None:
+    world = ring(0.2, memory="displacement")
+    group = Group([world, World.of(world, ring(0.5).kernel, modes=2, revealed=1), world])
+    (tmp_path / "a.npz").write_bytes(problem_bytes(group))
+    again = read_problem(tmp_path / "a.npz")
+    assert isinstance(again, Group)
+    assert problem_digest(again) == problem_digest(group)
+    assert (again.modes, again.targets) == (2, (0, 1, 0))
+
+
+def test_plans_are_learned_and_solved_for_and_united(tmp_path: Path) -> None:
+    group = Group([ring(0.1, memory="displacement", clip=1)] * 2)
+    solved = tm.solve(group)
+    assert solved.policy.name == "union"
+    assert solved.lower is None
+    assert evaluate(group, solved, width=0.1).aihtr.mean < solved.upper
+    few: dict[str, Any] = {"total_frames": 2000, "frames_per_batch": 1000}
+    run = tm.train(group, folder=tmp_path, **few, **{"evaluation.width": 0.1})
+    again = evaluate(group, tm.load_run(tmp_path), width=0.1)
+    assert run.summary["several"]["merge"] == "union"
+    assert run.summary["several"]["figures"]["aihtr"]["mean"] == again.aihtr.mean
+
+
+def test_what_modes_do_not_go_with_is_refused() -> None:
+    for more, message in (
+        ({"revealed": 2}, "revealed=2, expected none with several targets"),
+        ({"budget": 1}, "budget=1 and modes=2, expected none"),
+    ):
+        with pytest.raises(UserError, match=message):
+            Group([ring(0.1, **more)] * 2)
+    with pytest.raises(UserError, match=r"targets\.merge=gains: expected union with hidden modes"):
+        evaluate(Group([ring(0.1)] * 2), "none", merge="gains")
+    with pytest.raises(UserError, match=r"task\.memory=displacement: expected cell"):
+        tm.train(Group([ring(0.1, memory="displacement")] * 2), "ppo")
