@@ -37,7 +37,7 @@ class TargetsConfig(NodeConfig):
         joint = learner is not None and learner.joint
         # The union of all targets' own sets, on recorded tracks and with modes, needs no prediction.
         united = (hides or not root.kernel.is_motion) and not joint and root.cost.budget is None
-        own = root.task.memory if united else "cell"
+        own: Any = root.task.memory if united else "cell"
         for place, value, expected in (
             ("grid.window", root.grid.window, None),
             ("task.memory", root.task.memory, own),
