@@ -29,15 +29,15 @@ class TargetsConfig(NodeConfig):
         if hides and root.kernel.reveals:
             raise refuse("kernel.reveals", True, f"false {with_several}")
         if hides and root.cost.budget is not None:
-            expected = f"null with hidden modes and {key}.count={self.count}"
-            raise refuse("cost.budget", root.cost.budget, expected)
+            both = f"null with hidden modes and {key}.count={self.count}"
+            raise refuse("cost.budget", root.cost.budget, both)
         if root.sensor.name == "false_alarm":
             raise refuse("sensor", root.sensor.name, f"perfect, miss or footprint {with_several}")
         learner: Any = getattr(root, "algo", None)
         joint = learner is not None and learner.joint
         # The union of all targets' own sets, on recorded tracks and with modes, needs no prediction.
         united = (hides or not root.kernel.is_motion) and not joint and root.cost.budget is None
-        own: Any = root.task.memory if united else "cell"
+        own = root.task.memory if united else "cell"
         for place, value, expected in (
             ("grid.window", root.grid.window, None),
             ("task.memory", root.task.memory, own),
@@ -55,7 +55,7 @@ class MergedTargetsConfig(TargetsConfig):
 
     merge: str | None = option(
         "gains: a sensor is on where the gains of all targets together exceed its price; union: the sensors of all "
-        "targets' own sets; null: gains, on recorded tracks union",
+        "targets' own sets; null: gains, on recorded tracks and with hidden modes union",
         choices=("gains", "union"),
     )
 
