@@ -151,20 +151,26 @@ def test_a_network_that_reads_all_targets_is_not_merged() -> None:
 
 @pytest.mark.parametrize("merge", ["gains", "union"])
 def test_one_targets_plan_is_learned_and_merged(merge: str, tmp_path: Path) -> None:
-    words = {"total_frames": 4096, "frames_per_batch": 2048, "envs": 64}
-    run = tm.train(group(), "model_based", folder=tmp_path, **words, **{"targets.merge": merge})
+    few = {"total_frames": 4096, "frames_per_batch": 2048, "envs": 64}
+    pair = group(cost=0.3)
+    run = tm.train(pair, "model_based", folder=tmp_path, **few, **{"targets.merge": merge})
     assert run.several is not None
-    merged = evaluate(group(), run.policy, merge=merge)
+    merged = evaluate(pair, run.policy, merge=merge)
     assert merged.exact
     assert run.summary["several"]["figures"]["aihtr"]["mean"] == merged.aihtr.mean
-    assert run.evaluation.aihtr == pytest.approx(evaluate(group().kinds[0], run.policy).aihtr)
-    best = evaluate(group(), solve(group()), merge="gains")
+    assert run.evaluation.aihtr == pytest.approx(evaluate(pair.kinds[0], run.policy).aihtr)
+    best = evaluate(pair, solve(pair), merge="gains")
     assert run.several.merged is not None
     assert run.several.merged.aihtr.mean == best.aihtr.mean
     assert merged.aihtr.mean <= run.summary["several"]["upper"]
-    assert main(["evaluate", f"run={tmp_path}", f"targets.merge={merge}", "quiet=true"]) == 0
-    written = json.loads((tmp_path / "evaluation.json").read_text(encoding="utf-8"))
-    assert written["figures"]["aihtr"]["mean"] == merged.aihtr.mean
+    for words in ([f"targets.merge={merge}"], []):  # by default as it was learned
+        assert main(["evaluate", f"run={tmp_path}", *words, "quiet=true"]) == 0
+        written = json.loads((tmp_path / "evaluation.json").read_text(encoding="utf-8"))
+        assert written["figures"]["aihtr"]["mean"] == merged.aihtr.mean
+    words = ["compare", f"run={tmp_path}", "baseline=qmdp", "quiet=true"]
+    assert main([*words, f"hydra.run.dir={tmp_path / 'c'}"]) == 0
+    written = json.loads((tmp_path / "c" / "comparison.json").read_text(encoding="utf-8"))
+    assert written["policies"][0]["figures"]["aihtr"]["mean"] == merged.aihtr.mean
 
 
 @pytest.mark.parametrize(
@@ -315,7 +321,7 @@ def test_runs_for_several_targets_are_compared_on_the_same_targets(tmp_path: Pat
     again = compared.policies[2].difference
     assert (again.mean, again.low, again.high) == (0.0, 0.0, 0.0)
     main(["compare", *(f"run={run}" for run in runs), f"hydra.run.dir={tmp_path}", "quiet=true"])
-    written = json.loads((tmp_path / "comparison.json").read_text(encoding="utf-8"))
+    written = json.loads((tmp_path / "c" / "comparison.json").read_text(encoding="utf-8"))
     assert written["tracks"] == compared.tracks
     assert written["policies"][1]["difference"]["mean"] == difference.mean
     assert "(other problem)" not in written["policies"][1]["name"]

@@ -11,6 +11,7 @@ import torch
 
 from trackmdp.config import CompareConfig, load_run_config
 from trackmdp.durable import write_json
+from trackmdp.solvers.evaluate import group_rule
 from trackmdp.training.compare import Comparison, compare
 from trackmdp.training.display import make_console, table
 from trackmdp.training.run import trained
@@ -28,9 +29,15 @@ def run(cfg: CompareConfig, folder: Path, problem: Subject) -> None:
     console, policies = make_console(cfg.quiet), dict[str, Any]()
     runs, baselines = cfg.runs or [], cfg.baselines or []
     found = [trained(each, torch.device("cpu")) for each in runs]
-    count = max((load_run_config(each).targets.count for each in runs), default=1)
+    several = [load_run_config(each).targets for each in runs]
+    count = max((each.count for each in several), default=1)
     if count > 1:
-        found = [(group_of(own, count), *rest) for own, *rest in found]
+        # As it was learned: without a word of its own `compare` merges by its default.
+        found = [
+            (group, group_rule(group, policy, each.merge) if each.merge else policy, name)
+            for each, (own, policy, name) in zip(several, found, strict=True)
+            for group in [group_of(own, count)]
+        ]
     if found:
         problem = found[0][0]
     # A run's folder may have the name of another's, or of a baseline; then its whole path is shown.

@@ -125,7 +125,8 @@ def _several(
     cfg: EvaluateConfig, group: Group, policy: Any, subject: str, folder: Path, at: Console
 ) -> float:
     """Evaluate for several targets: `evaluation.json`; returns the AIHTR."""
-    rule = group_rule(group, policy, cfg.targets.merge)
+    learned = load_run_config(cfg.run).targets.merge if cfg.run else None
+    rule = group_rule(group, policy, cfg.targets.merge or learned)
     with at.status("simulating all targets"):
         found = evaluate_group(rule, width=cfg.evaluation.width, seed=cfg.seed)
     apart, recorded, upper = None, group.recorded, upper_bound(group)
