@@ -28,6 +28,7 @@ from trackmdp.solvers.evaluate import evaluate, group_rule
 from trackmdp.solvers.several.group_tracker import GroupTracker
 from trackmdp.solvers.several.group_value import evaluate_group
 from trackmdp.solvers.several.merging import make_rule
+from trackmdp.training.evaluator import estimated_qmdp
 from trackmdp.world.group import Group
 from trackmdp.world.problem_file import problem_bytes, problem_digest, read_problem
 
@@ -205,11 +206,26 @@ def test_a_snapshot_continues_with_the_same_tracks() -> None:
 
 
 def test_unions_are_the_default_but_with_a_budget() -> None:
-    assert group_rule(several(2), "none").name == "union"
-    assert group_rule(several(2, budget=1), "none").name == "gains"
+    few, many = several(2, budget=1), several(2)
+    assert group_rule(many, estimated_qmdp(many.single)).name == "union"
+    assert group_rule(few, estimated_qmdp(few.single)).name == "gains"
     world = tm.make_world("random_walk", size=3)
-    assert group_rule(Group([world] * 2), "none").name == "gains"
-    assert evaluate(several(2, budget=1), "none").sensors_per_step.mean <= 1
+    assert group_rule(Group([world] * 2), "qmdp").name == "gains"
+    assert 0 < evaluate(few, estimated_qmdp(few.single)).sensors_per_step.mean <= 1
+    assert group_rule(few, "none", "union").name == "union"  # as a log of it says
+
+
+@pytest.mark.parametrize("targets", [several(2, budget=1), Group([tm.make_world(size=3)] * 2)])
+def test_no_sensor_is_on_where_none_is_asked_for(targets: Group) -> None:
+    """Gains would switch some on: a miss is worth less where the sensors of no plan find the target again."""
+    assert evaluate(targets, "none").sensors_per_step.mean == 0
+    (episode, *_) = tm.simulate(targets, "none", 2)
+    assert not episode.action.any()
+
+
+def test_all_sensors_are_on_where_all_are_asked_for() -> None:
+    targets = Group([tm.make_world(size=3)] * 2)
+    assert all(each.action.all() for each in tm.simulate(targets, "all_on", 3))
 
 
 @pytest.mark.parametrize("memory", ["displacement", "displacement_gap", "two_displacements"])

@@ -130,7 +130,7 @@ def test_targets_that_never_leave_are_followed_for_the_steps_allowed() -> None:
     assert group.expected_steps == 6
     assert evaluate(group, "none", merge="union").exact
     with pytest.raises(UserError, match="never"):
-        evaluate(group, "none")
+        evaluate(group, "none", merge="gains")
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -253,7 +253,7 @@ def test_a_sensor_is_on_where_all_gains_together_exceed_its_price() -> None:
     world = World(np.array([[0.5, 0.4], [0.4, 0.5]]), (1, 2), cost=0.7, t_max=0, safe_cost=1.4)
     group = Group([world] * 2)
     none = Policy.none(world)
-    rule, apart = make_rule(group, [none]), make_rule(group, [none], "union")
+    rule, apart = (make_rule(group, [none], merge) for merge in ("gains", "union"))
     seen = Clocks(np.zeros((1, 2), np.int64), np.zeros((1, 2), np.int64), np.ones((1, 2), bool))
     moved = Beliefs.at(np.arange(2), np.zeros(2, np.int64)).moved(group)
     value = evaluate(world, none).value

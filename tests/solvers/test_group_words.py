@@ -106,7 +106,7 @@ def test_other_targets_and_policies_are_refused() -> None:
     with pytest.raises(UserError, match="merge: an option of several targets"):
         evaluate(world, "none", merge="gains")  # type: ignore[call-overload]
     with pytest.raises(UserError, match="expected gains with a budget"):
-        evaluate(Group([world.but(budget=1)] * 2), "none", merge="union")
+        evaluate(Group([world.but(budget=1)] * 2), "qmdp", merge="union")
 
 
 def test_plans_go_with_their_motions_to_other_targets() -> None:

@@ -55,7 +55,7 @@ class MergedTargetsConfig(TargetsConfig):
 
     merge: str | None = option(
         "gains: a sensor is on where the gains of all targets together exceed its price; union: the sensors of all "
-        "targets' own sets; null: gains, on recorded tracks and with hidden modes union",
+        "targets' own sets; null: gains, but union on recorded tracks, with hidden modes, and of all_on and none",
         choices=("gains", "union"),
     )
 

@@ -319,19 +319,23 @@ class Merged(Rule):
 def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str | None = None) -> Rule:
     """The policy for several targets that single ones make, merged by `gains`, or their plain `union`.
 
-    None: by gains, but the union on recorded tracks, of which the moves pooled by cell say too little, and with hidden
-    modes, where a plan's worth is no sum over cells. A budget needs gains.
+    None: by gains, but the union on recorded tracks, of which the moves pooled by cell say too little, with hidden modes,
+    where a plan's worth is no sum over cells, and of one set for all that may be known, such as `none`, that set: its
+    gains would make another policy of it. Else a budget needs gains.
     """
-    kinds = {"gains": Merged, "union": Union}
+    kinds, limited = {"gains": Merged, "union": Union}, group.task.budget is not None
+    one_set = all(each.alike for each in tables) and (
+        len({each.sets.indices.tobytes() for each in tables}) == 1
+    )
     if merge is None:
         known = group.recorded is None and group.modes == 1
-        merge = "gains" if known or group.task.budget is not None else "union"
+        merge = "gains" if not one_set and (known or limited) else "union"
     if merge not in kinds:
         raise UserError(f"merge={merge}: expected gains or union")
     if merge == "gains" and group.modes > 1:
         raise UserError("targets.merge=gains: expected union with hidden modes")
-    if merge == "union" and (budget := group.task.budget) is not None:
-        raise UserError(f"targets.merge=union: expected gains with a budget, {budget}")
+    if merge == "union" and limited and not one_set:
+        raise UserError(f"targets.merge=union: expected gains with a budget, {group.task.budget}")
     return kinds[merge](group, tables)
 
 
