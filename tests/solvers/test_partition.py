@@ -358,7 +358,6 @@ def test_pythons_tracker_of_semaphores_does_not_die_of_the_groups_signals() -> N
 import signal
 from multiprocessing.resource_tracker import _resource_tracker as tracker
 from pathlib import Path
-from typing import Any
 from trackmdp.solvers.workers import starting
 with starting():
     tracker.ensure_running()
