@@ -162,8 +162,9 @@ class Own:
         chosen: BoolArray = gained > price
         chosen = chosen if self.allowed is None else chosen & self.allowed
         if self.budget is not None:
-            net = np.where(chosen, gained - price, -np.inf)
-            chosen &= largest(self.rows, net, self.budget)
+            some = np.flatnonzero(chosen.any(axis=1))  # few, and to sort all takes long
+            net = np.where(chosen, gained - price, -np.inf)[some]
+            chosen[some] &= largest(self.rows[some], net, self.budget)
         return chosen
 
     def cover(self, gain: Array, price: Array, *, exact: bool = False) -> Cover:  # noqa: ARG002
