@@ -20,8 +20,6 @@ from io import BufferedReader
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-import yaml  # type: ignore[import-untyped]  # a dependency of OmegaConf
-
 from trackmdp.errors import UserError
 from trackmdp.machine import free_bytes
 
@@ -39,9 +37,6 @@ _COPIES = 2
 """Times that the bytes of an archive's arrays are in memory while it is read."""
 
 _DEEPEST = 50
-_YAML = getattr(
-    yaml, "CSafeLoader", yaml.SafeLoader
-)  # libyaml is ten times faster, and not always there
 
 
 def opened(file: Path, *, most: int, source: str = "", links: bool = False) -> BufferedReader:
@@ -171,15 +166,19 @@ def parse_yaml(text: str | bytes, source: str) -> dict[str, Any]:
     Raises:
         UserError: it is something else.
     """
+    import yaml  # type: ignore[import-untyped]  # a dependency of OmegaConf; a fifth of the time of `--version`
+
+    # libyaml is ten times faster, and not always there
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     with decoded(source, "a config"):
         depth = 0
-        for event in yaml.parse(text, Loader=_YAML):
+        for event in yaml.parse(text, Loader=loader):
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)
             # Nine lists of nine aliases each, ten times over, are 9^10 values in 700 bytes.
             if isinstance(event, yaml.AliasEvent) or depth > _DEEPEST:
                 raise ValueError(f"an alias, or deeper than {_DEEPEST} levels")
-        plain = yaml.load(text, Loader=_YAML)
+        plain = yaml.load(text, Loader=loader)
         if not isinstance(plain, (dict, type(None))):
             raise ValueError("expected a mapping")
         return {str(key): value for key, value in (plain or {}).items()}
