@@ -22,7 +22,6 @@ from trackmdp.sensing.decisions import sensing
 from trackmdp.sensing.programs import integer
 from trackmdp.solvers import bounds, lookahead, optimal, rules
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.solve import solve
 from trackmdp.solvers.value import replay
 from trackmdp.world.model import World
 
@@ -363,7 +362,5 @@ def test_recorded_tracks_are_replayed_with_footprints() -> None:
 
 def test_methods_that_need_a_sensor_a_cell() -> None:
     world = footprint_world(0)
-    with pytest.raises(UserError, match="block=2"):
-        solve(world, block=2)
     with pytest.raises(UserError, match="one cell"):
         evaluate(world, PolicyTable.all_on(world), false_alarm=0.1)

@@ -321,7 +321,7 @@ def test_runs_for_several_targets_are_compared_on_the_same_targets(tmp_path: Pat
     again = compared.policies[2].difference
     assert (again.mean, again.low, again.high) == (0.0, 0.0, 0.0)
     main(["compare", *(f"run={run}" for run in runs), f"hydra.run.dir={tmp_path}", "quiet=true"])
-    written = json.loads((tmp_path / "c" / "comparison.json").read_text(encoding="utf-8"))
+    written = json.loads((tmp_path / "comparison.json").read_text(encoding="utf-8"))
     assert written["tracks"] == compared.tracks
     assert written["policies"][1]["difference"]["mean"] == difference.mean
     assert "(other problem)" not in written["policies"][1]["name"]

@@ -129,24 +129,26 @@ class _Batch:
 
     def _taken(self, step: GroupStep) -> Columns:
         """The columns of a step."""
-        task, some = self._task, np.any(step.present, axis=1)
+        task, row = self._task, step.row
+        some, seen = np.any(step.present[row], axis=1), step.seen[row]
         action = np.zeros((self._shape[0], task.total_sensors), dtype=bool)
         action.ravel()[step.on] = True
+        action = action[row]
         spent = self._costs.price_of(torch.from_numpy(action))
-        spent = torch.where(torch.from_numpy(step.late), task.safe_cost, spent)
-        earned = task.reward * torch.from_numpy(step.seen).sum(-1)
+        spent = torch.where(torch.from_numpy(step.late[row]), task.safe_cost, spent)
+        earned = task.reward * torch.from_numpy(seen).sum(-1)
         columns: Columns = {
-            "misses": step.before.misses,
+            "misses": step.before.misses[row],
             "sensors": action.sum(axis=1),
             "bits": np.packbits(action, axis=1),
             "reward": (earned - spent * torch.from_numpy(some)).float().numpy(),
-            "target": np.where(step.inside, step.cell, task.num_cells),
-            "located": step.seen | step.entered,
+            "target": np.where(step.inside, step.cell, task.num_cells)[row],
+            "located": seen | step.entered[row],
             # In an episode's last step, whether a target was in the grid, which no exit ended then.
             "truncated": some,
-            "row": np.arange(len(action)),
+            "row": row,
         }
-        return {name: narrow(column[step.row]) for name, column in columns.items()}
+        return {name: narrow(column) for name, column in columns.items()}
 
     def beliefs(self) -> Iterator[sparse.csr_array]:
         """`[T · K, M]`, predicted in each step of each episode; see `Episode`."""

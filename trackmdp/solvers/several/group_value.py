@@ -134,12 +134,13 @@ class _Drawn:
 
     def move(self, row: IndexArray, step: int) -> None:  # noqa: ARG002
         """See `Moving`; every draw is made in every step."""
-        begin, end = self._kernel.indptr[self.state], self._kernel.indptr[self.state + 1]
-        wanted = self._sums[begin] + self._rng.random(self.state.shape)
+        here, inside = self.state[self.inside], self.inside.copy()
+        begin, end = self._kernel.indptr[here], self._kernel.indptr[here + 1]
+        wanted = self._sums[begin] + self._rng.random(self.state.shape)[self.inside]
         entry = np.searchsorted(self._sums, wanted, side="right") - 1
-        self.inside = self.inside & (entry < end)
-        self.state = self.state.copy()
-        self.state[self.inside] = self._kernel.indices[entry[self.inside]]
+        inside[self.inside] = entry < end
+        self.inside, self.state = inside, self.state.copy()
+        self.state[inside] = self._kernel.indices[entry[entry < end]]
 
     def ended(self) -> BoolArray:
         """See `Moving`."""
@@ -162,18 +163,19 @@ def _totals(rule: Rule, targets: Moving, seed: int) -> Array:
     found, known, kind = np.zeros((shape[0], 7)), np.stack(known_rewards(rule)), rule.group.kind
     cell = rule.group.cell_of(targets.state)
     for step in group_steps(rule, targets, lambda *_: rng.random(shape), predicted=False):
-        before, present, detections = step.before.present, step.present, step.seen.sum(axis=1)
+        row, present = step.row, step.present[step.row]
+        before, detections = step.before.present[row], step.seen[row].sum(axis=1)
         some, (episode, sensor) = present.any(axis=1), np.divmod(step.on, rule.sensors)
-        price = np.bincount(episode, task.paid[sensor], shape[0])
+        price = np.bincount(episode, task.paid[sensor], shape[0])[row]
         columns = (
-            task.reward * detections - np.where(step.late, task.safe_cost, price) * some,
+            task.reward * detections - np.where(step.late[row], task.safe_cost, price) * some,
             present.sum(axis=1),
             detections,
-            np.bincount(episode, minlength=shape[0]) * some,
-            step.late & some,
+            np.bincount(episode, minlength=shape[0])[row] * some,
+            step.late[row] & some,
             before.any(axis=1),
-            (known[kind, cell] * before).sum(axis=1),
+            (known[kind, cell[row]] * before).sum(axis=1),
         )
-        found += np.stack(columns, axis=1)
+        found[row] += np.stack(columns, axis=1)
         cell = step.cell
     return found

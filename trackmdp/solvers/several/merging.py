@@ -319,9 +319,9 @@ class Merged(Rule):
 def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str | None = None) -> Rule:
     """The policy for several targets that single ones make, merged by `gains`, or their plain `union`.
 
-    None: by gains, but the union on recorded tracks, of which the moves pooled by cell say too little, with hidden modes,
-    where a plan's worth is no sum over cells, and of one set for all that may be known, such as `none`, that set: its
-    gains would make another policy of it. Else a budget needs gains.
+    None: by gains, but the union on recorded tracks, of which the moves pooled by cell say too little, with hidden
+    modes, where a plan's worth is no sum over cells, and of one set for all that may be known, such as `none`: gains
+    would make another policy of it. Else a budget needs gains.
     """
     kinds, limited = {"gains": Merged, "union": Union}, group.task.budget is not None
     one_set = all(each.alike for each in tables) and (

@@ -85,7 +85,6 @@ def group_steps(
     task, group, sensors = rule.task, rule.group, rule.sensors
     clocks = rule.start(group.cell_of(targets.state), targets.inside)
     beliefs, sure = Beliefs.of(group, clocks), task.perfect and task.safe
-    episode = np.repeat(np.arange(len(targets.state)), len(group))
     for number in itertools.count() if task.max_steps is None else range(task.max_steps):
         if not len(row := np.flatnonzero(clocks.present.any(axis=1))):
             return
@@ -96,7 +95,8 @@ def group_steps(
         targets.move(row, number)
         inside = targets.inside
         cell = np.where(inside, group.cell_of(targets.state), 0)
-        chance = report_chance(task, on, episode, cell.ravel()).reshape(cell.shape)
+        here, chance = np.flatnonzero(inside), np.zeros(cell.shape)
+        chance.ravel()[here] = report_chance(task, on, here // len(group), cell.ravel()[here])
         chance = np.where(late[:, None], task.safe_detection[cell], chance)
         report = chance > 0 if sure else draws(row, number) < chance
         seen = clocks.present & inside & report
