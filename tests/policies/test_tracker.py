@@ -279,6 +279,17 @@ def test_what_cannot_happen_leaves_a_belief_that_is_finite() -> None:
     assert tracker.belief().tolist() == [0, 0, 0, 1]
 
 
+def test_a_target_that_must_have_left_is_followed_from_a_state() -> None:
+    """It is in the last of two cells and moves on, yet it is said to be missed: no cell is left to it."""
+    world = World(np.eye(2, k=1), (1, 2), cost=0.1)
+    policy = Policy.none(world)
+    tracker = policy.tracker(1, world=world)
+    tracker.sensors()
+    tracker.report(None)
+    again = tm.Tracker.restore(policy, json.loads(json.dumps(tracker.state())), world)
+    assert again.belief().tolist() == [0, 0]
+
+
 def test_positions_are_those_of_the_cells_sensed() -> None:
     world = tm.make_world("drift", size=4, cell=10.0, origin=(0, 0))
     tracker = tm.solve(world).policy.tracker(at=(15, 15))

@@ -86,6 +86,29 @@ def test_a_state_that_does_not_fit_is_refused(change: dict[str, Any], message: s
         tm.Tracker.restore(policy, 5)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    ("change", "wanted"),
+    [
+        ({"on": [3, 4, 5]}, "on=[3, 4, 5]: expected at most 2 sensors that can be on, in order"),
+        ({"misses": 2, "on": [4]}, "on=[4]: expected all sensors, the safe action is due"),
+        ({"belief": [0.0] * 8 + [0.5]}, "belief, expected 9 probabilities that sum to 1"),
+        ({"belief": [1.0] + [1e-3] * 8}, "belief, expected 9 probabilities that sum to 1"),
+    ],
+)
+def test_a_state_that_no_tracker_has_is_refused(change: dict[str, Any], wanted: str) -> None:
+    world = small_world().but(budget=2)
+    policy = Policy.none(world)
+    tracker = policy.tracker(4, world=world)
+    tracker.sensors()
+    state = tracker.state()
+    assert tm.Tracker.restore(policy, state | {"on": [3, 4]}, world).sensors() == [3, 4]
+    due = tm.Tracker.restore(policy, state | {"misses": 2, "on": list(range(9))}, world)
+    assert due.safe
+    with pytest.raises(UserError) as caught:
+        tm.Tracker.restore(policy, state | change, world)
+    assert str(caught.value) == f"state: {wanted}"
+
+
 def test_a_state_of_another_memory_is_refused() -> None:
     state = some(WORLDS["gaps"]).tracker(3).state()
     with pytest.raises(

@@ -63,6 +63,14 @@ def test_a_tracker_of_two_goes_on_from_its_state() -> None:
         ({"misses": [0, 3]}, "state: misses=3: expected an integer from 0 to 2"),
         ({"present": [1, 0]}, "state: expected True or False as present"),
         ({"on": [16]}, "state: on=16: expected an integer from 0 to 15"),
+        (
+            {"on": [0], "misses": [0, 2]},
+            "state: on=[0]: expected all sensors, the safe action is due",
+        ),
+        (
+            {"belief": [[0.5] + [0.0] * 15, None]},
+            "state: belief, expected 16 probabilities that sum",
+        ),
         ({"belief": [[1.0], None]}, "state: belief, expected 16 probabilities"),
         ({"task": {}}, "state: made for {}, expected {'size': "),
         (

@@ -123,19 +123,30 @@ class Following(ABC):
         """The sensors that are on in a state.
 
         Raises:
-            UserError: a number is no sensor that can be chosen.
+            UserError: they are not all where the safe action is due, or no set that can be chosen where it is not.
         """
         if not isinstance(on, list | None):
             raise UserError("state: expected a list or None as on")
-        last = self._task.total_sensors - 1
-        found = [whole_number("state: on", each, 0, last) for each in on or ()]
-        if found != sorted(set(found)) or not self._possible(np.array(found, np.int64)).all():
-            raise UserError(f"state: on={found}: expected sensors that can be on, in order")
-        return None if on is None else found
+        if on is None:
+            return None
+        last, everything = self._task.total_sensors - 1, np.flatnonzero(self._task.available)
+        found = [whole_number("state: on", each, 0, last) for each in on]
+        if self.safe:
+            fits, wanted = found == everything.tolist(), "all sensors, the safe action is due"
+        else:
+            most = self._task.budget
+            possible = self._possible(np.array(found, np.int64))
+            fits = found == sorted(set(found)) and bool(possible.all())
+            fits = fits and (most is None or len(found) <= most)
+            limit = "" if most is None else f"at most {most} "
+            wanted = f"{limit}sensors that can be on, in order"
+        if not fits:
+            raise UserError(f"state: on={found}: expected {wanted}")
+        return found
 
 
 def probabilities(given: Any, states: int) -> Array:
-    """`[1, states]`, the belief in a state.
+    """`[1, states]`, the belief in a state; zeros for a target that by its motion must have left.
 
     Raises:
         UserError: there are no such probabilities in it.
@@ -143,6 +154,6 @@ def probabilities(given: Any, states: int) -> Array:
     numbers = given if isinstance(given, list) else []
     if all(type(each) in (int, float) and 0 <= each <= 1.1 for each in numbers):
         found = np.array([numbers], dtype=np.float64)
-        if found.shape[1] == states and 0 < found.sum() < 1.1:
+        if found.shape[1] == states and (not found.any() or abs(found.sum() - 1.0) < 1e-6):
             return found
-    raise UserError(f"state: belief, expected {states} probabilities")
+    raise UserError(f"state: belief, expected {states} probabilities that sum to 1")
