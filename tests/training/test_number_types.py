@@ -42,3 +42,16 @@ def test_numbers_of_another_type_are_refused_in_one_line(
     assert main(["train", f"resume={tmp_path / 'run'}", *words]) == 2
     error = capfd.readouterr().err
     assert (len(error.splitlines()), f"{kind}, expected" in error) == (1, True)
+
+
+def test_whole_rewards_in_a_buffer_are_refused(tmp_path: Path, capfd: Any) -> None:
+    """The first batch would else end in a traceback of torch's."""
+    train(tmp_path / "run", algo="dqn")
+    state = checkpoint.load(checkpoint.newest(tmp_path / "run"))["algorithm"]
+    stored = state["buffer"]["_storage"]["_storage"]
+    stored["next.reward"] = stored["next.reward"].long()
+    forged(tmp_path / "run", algorithm=state)
+    capfd.readouterr()
+    words = ["collector.total_frames=4096", "checkpoint.keep=1"]
+    assert main(["train", f"resume={tmp_path / 'run'}", *words]) == 2
+    assert "next.reward: torch.int64, expected torch.float32" in capfd.readouterr().err

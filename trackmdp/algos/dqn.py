@@ -160,8 +160,9 @@ class _ZeroedStorage(LazyTensorStorage):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continue from a `state_dict`, in whose types all later transitions are stored."""
         for name, part in flatten(state_dict).items():
+            real = name.endswith(("reward", "discount"))
             if isinstance(part, Tensor):
-                check_type(name, part, torch.float32, torch.int64, torch.bool)
+                check_type(name, part, *((torch.float32,) if real else (torch.int64, torch.bool)))
         super().load_state_dict(state_dict)
 
 
