@@ -90,6 +90,8 @@ def test_the_digest_depends_on_the_place() -> None:
 
 ARRAYS = problem_arrays(three_parts())
 PLACED = problem_arrays(placed())
+TWO = problem_arrays(tm.Group([small_world(), small_world(seed=1)]))
+"""Kernels of 9 + 9 states, members 0 and 1."""
 
 
 @pytest.mark.parametrize(
@@ -108,6 +110,9 @@ PLACED = problem_arrays(placed())
         npz_bytes(PLACED | {"place.corner": np.zeros(3)}),
         npz_bytes(PLACED | {"place.corner": np.float64(0)}),
         npz_bytes(PLACED | {"place.crs": np.str_("/etc/passwd")}),
+        npz_bytes(TWO | {"members": np.array([-1, 1])}),  # two numbers, one motion
+        npz_bytes(TWO | {"kernel.indices": (TWO["kernel.indices"] + 9) % 18}),
+        npz_bytes(TWO | {"kernel.shape": np.array([18, 20])}),
         npz_bytes(PLACED | {"place.crs": np.int64(2056)}),
         npz_bytes(PLACED | {"place.more": np.int64(1)}),
         npz_bytes(ARRAYS | {"tracks.first": np.array([0, 3, 99])}),

@@ -113,13 +113,17 @@ def subject_in(stream: BinaryIO) -> Subject:
 def _group(given: dict[str, Any], members: Indices) -> Group:
     """The group of the arguments of its first world, with the `kernel` of all kinds and the kind of each target."""
     kernel = given.pop("kernel")
-    states = math.prod(given["size"]) * given.get("modes", 1)
-    kinds = len(np.unique(members))
-    if members.ndim != 1 or kernel.shape[0] != kinds * states or members.max() != kinds - 1:
-        raise ValueError(f"kinds {members.shape} of {kernel.shape[0]} states")
+    states = math.prod(map(int, given["size"])) * int(given.get("modes", 1))
+    kinds = np.unique(members)
+    numbered = members.ndim == 1 and np.array_equal(kinds, range(len(kinds)))
+    if not numbered or kernel.shape != (len(kinds) * states,) * 2:
+        raise ValueError(f"kinds {members.shape} of {kernel.shape} states")
     # A target keeps its motion, so that all moves are in the blocks on the diagonal.
-    blocks = [slice(kind * states, (kind + 1) * states) for kind in range(kinds)]
-    worlds = [World(kernel[block][:, block], **given) for block in blocks]
+    places = [slice(kind * states, (kind + 1) * states) for kind in kinds]
+    blocks = [kernel[place][:, place] for place in places]
+    if sum(block.nnz for block in blocks) != kernel.nnz:
+        raise ValueError("moves from one kind of target to another")
+    worlds = [World(block, **given) for block in blocks]
     return Group([worlds[kind] for kind in members])
 
 
