@@ -9,16 +9,19 @@ from collections.abc import Iterable
 
 _SCRIPT = """\
 _trackmdp() {
-    local word=${COMP_WORDS[COMP_CWORD]} command=${COMP_WORDS[1]} choices
+    local word=${COMP_WORDS[COMP_CWORD]} command=${COMP_WORDS[1]} choice
     if (( COMP_CWORD == 1 )); then
         mapfile -t COMPREPLY < <(compgen -S ' ' -W '%(commands)s' -- "$word")
         return
     fi
     # The program reads a line without the command; choices that begin with base_ are parts of others, and given
     # stands for a problem made in Python.
-    choices=$(COMP_LINE="${COMP_WORDS[0]} ${COMP_LINE#*" $command"}" \\
+    COMPREPLY=()
+    while read -r choice; do
+        # Not compgen -W: it would run $(...) in the name of a file.
+        [[ $choice != "$word"* ]] || COMPREPLY+=("$(printf %%q "$choice")")
+    done < <(COMP_LINE="${COMP_WORDS[0]} ${COMP_LINE#*" $command"}" \\
         "${COMP_WORDS[0]}" "$command" -sc query=bash 2>/dev/null | tr ' ' '\\n' | grep -v -e '=base_' -e '=given$')
-    mapfile -t COMPREPLY < <(compgen -W "$choices" -- "$word")
 }
 COMP_WORDBREAKS=${COMP_WORDBREAKS//=}
 complete -o nospace -o default -F _trackmdp trackmdp
