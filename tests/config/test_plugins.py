@@ -158,6 +158,15 @@ def test_its_options_are_checked(site: Path, tmp_path: Path) -> None:
             {"outside/__init__.py": "import no_such_module"},
             "cannot be loaded (ModuleNotFoundError: No module named",
         ),
+        ({"outside/__init__.py": None}, "cannot be loaded (TypeError: "),  # a folder has no file
+        ({"outside/__init__.py": "raise SystemExit"}, "cannot be loaded (SystemExit: "),
+        (
+            {
+                "outside/__init__.py": "thing = 3",
+                "outside-1.0.dist-info/entry_points.txt": "[trackmdp.plugins]\noutside = outside:thing",
+            },
+            "cannot be loaded (AttributeError: 'int' object has no attribute '__file__'",
+        ),
         ({"outside/conf/algo/lazy.yaml": None}, "algo/lazy.yaml with the values of algo=lazy"),
         ({"outside/jump_config.py": TWICE}, "kernel=drift: offered by"),
     ],

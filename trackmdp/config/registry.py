@@ -79,13 +79,13 @@ def load_plugins() -> tuple[Path, ...]:
         known = {(group, name) for group, members in GROUPS.items() for name in members}
         try:
             module = entry.load()  # registers its choices
-        except Exception as error:  # of any kind, from a module of others
+            folders.append(Path(module.__file__).parent / "conf")
+        except (Exception, SystemExit) as error:  # of any kind, from a module of others
             package = entry.dist.name if entry.dist else entry.value
             raise UserError(
                 f"plugin {entry.name} of {package}: cannot be loaded ({type(error).__name__}: {error}); "
                 "repair it or uninstall it"
             ) from error
-        folders.append(Path(module.__file__).parent / "conf")
         for group, name in {(g, n) for g, members in GROUPS.items() for n in members} - known:
             # Else Hydra would report it as a missing file of ours, and only once the choice is typed.
             if not (file := folders[-1] / group / f"{name}.yaml").is_file():
