@@ -17,7 +17,7 @@ from trackmdp.errors import RunError
 from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.world.model import World
 from trackmdp.world.problem import Problem
-from trackmdp.world.problem_file import problem_digest, read_problem
+from trackmdp.world.problem_file import problem_bytes, problem_digest, read_problem
 
 QUICK: dict[str, Any] = {
     "total_frames": 1024,
@@ -97,3 +97,19 @@ def test_a_config_stays_small_whatever_the_grid(tmp_path: Path) -> None:
     assert main(["export", f"run={run}", "format=sets", *out]) == 0
     assert main(["train", f"resume={run}", "quiet=true"]) == 0
     assert main(["report", f"sweep={run}", "quiet=true"]) == 0
+
+
+@pytest.mark.parametrize("command", ["evaluate", "export", "compare"])
+def test_targets_copied_from_another_run_are_refused_in_one_line(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    quick = {name: QUICK[name] for name in QUICK if name != "hidden"}
+    tm.train(small_world(), folder=tmp_path / "run", **quick)
+    file = tmp_path / "run/problem.npz"
+    file.write_bytes(problem_bytes(tm.Group([small_world()] * 2)))
+    capsys.readouterr()
+    words = [f"runs=[{tmp_path}/run]", "baselines=[none]"]
+    words = words if command == "compare" else [f"run={tmp_path}/run"]
+    assert main([command, *words, f"hydra.run.dir={tmp_path}/out"]) == 2
+    assert capsys.readouterr().err.endswith(f"{file}: 2 targets, expected 1\n")
+    assert not (tmp_path / "out").exists()

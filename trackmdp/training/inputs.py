@@ -13,10 +13,11 @@ import numpy as np
 from trackmdp.algos.estimates.alike import cell_classes
 from trackmdp.config import TrainConfig
 from trackmdp.config.checks import own_paths
-from trackmdp.config.learning import file_of_classes
+from trackmdp.config.learning import file_of_classes, together
 from trackmdp.config.resume import fixed_options
 from trackmdp.config.tree import config_text
 from trackmdp.durable import write_bytes, write_text
+from trackmdp.errors import UserError
 from trackmdp.world.configured import make_problem
 from trackmdp.world.group import Group, Subject, learned_in
 from trackmdp.world.make import OF_TASK
@@ -39,11 +40,14 @@ def problem_of(config: TrainConfig, folder: Path) -> Subject:
     """The problem of the run in `folder`; before it has begun, the one that its config describes.
 
     Raises:
-        UserError: a file is missing, damaged or malformed.
+        UserError: a file is missing, damaged or malformed, or has another number of targets than the config.
     """
     begun = (folder / "config.yaml").is_file()
     if begun:
-        return read_problem(folder / PROBLEM)
+        problem = read_problem(folder / PROBLEM)
+        if (count := max(len(problem.targets), 1)) != (own := together(config)):
+            raise UserError(f"{folder / PROBLEM}: {count} targets, expected {own}")
+        return problem
     return learned_in(make_problem(config), config.targets.count, joint=config.algo.joint)
 
 
