@@ -7,14 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import trackmdp as tm
 from tests.helpers import small_world
 from tests.tracks import drawn, recorded
 from tests.training.runs import assert_same_run
 from trackmdp.app.cli import main
-from trackmdp.errors import RunError
+from trackmdp.errors import RunError, UserError
 from trackmdp.training.callbacks import Callback, Row, Training
+from trackmdp.training.run import trained
 from trackmdp.world.model import World
 from trackmdp.world.problem import Problem
 from trackmdp.world.problem_file import problem_bytes, problem_digest, read_problem
@@ -113,3 +115,13 @@ def test_targets_copied_from_another_run_are_refused_in_one_line(
     assert main([command, *words, f"hydra.run.dir={tmp_path}/out"]) == 2
     assert capsys.readouterr().err.endswith(f"{file}: 2 targets, expected 1\n")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_grid_copied_from_another_run_is_refused(tmp_path: Path) -> None:
+    """Before a checkpoint tells, or where there is none: by blocks the config of 12 x 12 cells was taken for 3 x 3."""
+    quick = {name: QUICK[name] for name in QUICK if name != "hidden"}
+    tm.train(small_world(), folder=tmp_path / "run", **quick)
+    file = tmp_path / "run/problem.npz"
+    file.write_bytes(problem_bytes(small_world(4)))
+    with pytest.raises(UserError, match=r"problem\.npz: 4 x 4 cells, expected 3 x 3 cells$"):
+        trained(str(tmp_path / "run"), torch.device("cpu"))

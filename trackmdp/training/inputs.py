@@ -18,6 +18,7 @@ from trackmdp.config.resume import fixed_options
 from trackmdp.config.tree import config_text
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.errors import UserError
+from trackmdp.notebook.card import grid_words
 from trackmdp.world.configured import make_problem
 from trackmdp.world.group import Group, Subject, learned_in
 from trackmdp.world.make import OF_TASK
@@ -40,13 +41,17 @@ def problem_of(config: TrainConfig, folder: Path) -> Subject:
     """The problem of the run in `folder`; before it has begun, the one that its config describes.
 
     Raises:
-        UserError: a file is missing, damaged or malformed, or has another number of targets than the config.
+        UserError: a file is missing, damaged or malformed, or is of another grid or number of targets than the config.
     """
     begun = (folder / "config.yaml").is_file()
     if begun:
         problem = read_problem(folder / PROBLEM)
         if (count := max(len(problem.targets), 1)) != (own := together(config)):
             raise UserError(f"{folder / PROBLEM}: {count} targets, expected {own}")
+        if (found := problem.task.size) != (sides := config.grid.sides):
+            raise UserError(
+                f"{folder / PROBLEM}: {grid_words(found)}, expected {grid_words(sides)}"
+            )
         return problem
     return learned_in(make_problem(config), config.targets.count, joint=config.algo.joint)
 
