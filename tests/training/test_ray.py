@@ -94,6 +94,25 @@ def test_workers_that_do_not_start_keep_no_cores(
     assert [each.ended for each in made] == [True]
 
 
+def test_a_worker_that_is_killed_while_it_starts_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ray is told by an exception that is none of Python's own, of many lines; no Ray is started."""
+    from ray.exceptions import RayActorError
+
+    class Killed(_Collector):
+        def __init__(self, *args: object, **options: object) -> None:
+            raise RayActorError
+
+        def __del__(self) -> None:
+            pass
+
+    monkeypatch.setattr(on_ray, "_Collector", Killed)
+    message = r"^collector=ray: a worker did not start \(a worker was lost: [^\n]*\)$"
+    with pytest.raises(RunError, match=message):
+        run(train_config(*WORDS.split()), tmp_path)
+
+
 @pytest.mark.long
 def test_a_cluster_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="expected a Ray cluster"):

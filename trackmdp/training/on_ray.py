@@ -40,23 +40,28 @@ def ray(
     # RayCollector has no such argument; the collectors that it makes in its workers have.
     register = common.pop("auto_register_policy_transforms")
     cores = max(1, round(cfg.workers * cfg.cpus_per_worker))
-    with joining("collector.address", cfg.address):
-        made = _Collector(
-            of_workers(partial(_remote_env, cfg.threads), env, cfg, done),
-            policy,
-            sync=True,
-            ray_init_config=ray_options(cfg.address, cores, _STORE) | {"log_to_driver": False},
-            # Both are always given: TorchRL asks for 0.2 GPUs by default, and on a cluster without GPUs no worker
-            # would ever start.
-            remote_configs={"num_cpus": cfg.cpus_per_worker, "num_gpus": cfg.gpus_per_worker},
-            collector_kwargs={"auto_register_policy_transforms": register, "track_traj_ids": False},
-            postproc=_rows,
-            **common,
-        )
+    made = None
     try:
+        with _losing(), joining("collector.address", cfg.address):
+            made = _Collector(
+                of_workers(partial(_remote_env, cfg.threads), env, cfg, done),
+                policy,
+                sync=True,
+                ray_init_config=ray_options(cfg.address, cores, _STORE) | {"log_to_driver": False},
+                # Both are always given: TorchRL asks for 0.2 GPUs by default, and on a cluster without GPUs no worker
+                # would ever start.
+                remote_configs={"num_cpus": cfg.cpus_per_worker, "num_gpus": cfg.gpus_per_worker},
+                collector_kwargs={
+                    "auto_register_policy_transforms": register,
+                    "track_traj_ids": False,
+                },
+                postproc=_rows,
+                **common,
+            )
         made.update_policy_weights_()
     except RuntimeError as error:  # TorchRL waits a minute for each of them
-        made.shutdown()  # else they would keep their cores of a cluster that goes on
+        if made is not None:
+            made.shutdown()  # else they would keep their cores of a cluster that goes on
         raise not_started(cfg, error) from error
     return made
 
