@@ -119,7 +119,7 @@ def test_metrics_are_a_frame_where_pandas_is(monkeypatch: pytest.MonkeyPatch) ->
     assert run.metrics == run.columns
 
 
-@pytest.mark.parametrize("ending", ["gif", "mp4"])
+@pytest.mark.parametrize("ending", ["gif", pytest.param("mp4", marks=pytest.mark.slow)])
 def test_an_episode_is_written_as_a_video(ending: str, tmp_path: Any) -> None:
     """A frame for each step; nothing else is left in the folder."""
     pytest.importorskip("imageio_ffmpeg")

@@ -322,7 +322,7 @@ def test_a_recorded_group_is_read_back(tmp_path: Path) -> None:
     assert evaluate(again, "none").aihtr == evaluate(targets, "none").aihtr
 
 
-@pytest.mark.parametrize("memory", ["cell", "displacement"])
+@pytest.mark.parametrize("memory", ["cell", pytest.param("displacement", marks=pytest.mark.slow)])
 def test_a_plan_is_learned_and_its_sets_united(memory: str, tmp_path: Path) -> None:
     words = ["kernel=tracks", f"kernel.path={write(tmp_path / 'a.csv', APART30)}", "grid.size=3"]
     words.append(f"task.memory={memory}")

@@ -70,13 +70,13 @@ def check(seed: int) -> None:
             assert evaluate_group(rule).aihtr.mean == pytest.approx(alone, abs=1e-9)
 
 
-@pytest.mark.parametrize("seed", [2, 3, 12])
+@pytest.mark.parametrize("seed", [2, 12])
 def test_brute_force_lies_between_the_policies_and_the_bound(seed: int) -> None:
     check(seed)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [*range(2), *range(4, 12), *range(13, 40)])
+@pytest.mark.parametrize("seed", [*range(2), *range(3, 12), *range(13, 40)])
 def test_brute_force_lies_between_them_in_many_more_worlds(seed: int) -> None:
     check(seed)
 
@@ -151,6 +151,7 @@ def test_environment_simulation_tracker_and_log_agree(tmp_path: Path) -> None:
         assert verify(reader).difference is None
 
 
+@pytest.mark.slow
 def test_networks_learn_of_all_targets_and_are_valued_alike(tmp_path: Path) -> None:
     world = tm.make_world("random_walk", size=3, exit_probability=0.2)
     rows = np.kron(np.eye(3), np.ones((1, 3)))  # a sensor for each row

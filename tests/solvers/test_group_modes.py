@@ -63,7 +63,10 @@ def test_brute_force_lies_between_the_policies_and_the_bound(more: dict[str, Any
         assert abs(played.aihtr.mean - exact.aihtr.mean) < 2 * half + 1e-9
 
 
-@pytest.mark.parametrize(("turn", "memory"), [(0.0, "cell"), (0.2, "cell"), (0.2, "displacement")])
+@pytest.mark.parametrize(
+    ("turn", "memory"),
+    [(0.0, "cell"), pytest.param(0.2, "cell", marks=pytest.mark.slow), (0.2, "displacement")],
+)
 def test_one_target_is_todays_world(turn: float, memory: str) -> None:
     world = ring(turn, memory=memory, clip=1, detection=0.8)
     for seed in range(4):
@@ -132,6 +135,7 @@ def test_a_group_is_the_same_from_its_file(tmp_path: Path) -> None:
     assert (again.modes, again.targets) == (2, (0, 1, 0))
 
 
+@pytest.mark.slow
 def test_plans_are_learned_and_solved_for_and_united(tmp_path: Path) -> None:
     group = Group([ring(0.1, memory="displacement", clip=1)] * 2)
     solved = tm.solve(group)

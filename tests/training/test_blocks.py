@@ -76,6 +76,7 @@ def test_blocks_without_a_sensor_have_nothing_to_learn(tmp_path: Path) -> None:
     assert len(list((tmp_path / "blocks").iterdir())) == 2  # of four
 
 
+@pytest.mark.slow
 def test_blocks_learn_with_footprints_and_a_budget() -> None:
     places = np.stack(np.divmod(np.arange(0, 64, 2), 8), axis=1)
     wide = world(window=None).but(

@@ -43,7 +43,7 @@ def group(**options: Any) -> Group:
     return tm.make_world("random_walk", **given)
 
 
-@pytest.mark.parametrize("algo", ["a2c", "ppo", "dqn"])
+@pytest.mark.parametrize("algo", ["a2c", pytest.param("ppo", marks=pytest.mark.slow), "dqn"])
 def test_a_run_that_is_cut_goes_on_as_one_that_was_not(
     algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

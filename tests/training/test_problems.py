@@ -54,7 +54,13 @@ PROBLEMS: dict[str, Problem] = {
 }
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in ("modes", "footprints") else pytest.mark.slow)
+        for name in PROBLEMS
+    ],
+)
 def test_a_problem_from_python_is_used_by_every_command(name: str, tmp_path: Path) -> None:
     problem = PROBLEMS[name]
     run = tm.train(problem, "a2c", folder=tmp_path / "sweep/whole", **QUICK)
