@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 
 import trackmdp as tm
 from tests.solvers.test_group import best_of_all
+from trackmdp.app.cli import main
 from trackmdp.environment.group_dynamics import GroupDynamics
 from trackmdp.environment.group_paths import GroupPaths
 from trackmdp.episodes.reader import EpisodeReader, verify
@@ -22,6 +24,7 @@ from trackmdp.solvers.evaluate import evaluate, group_rule
 from trackmdp.solvers.several.group_bounds import upper_bound
 from trackmdp.solvers.several.group_tracker import GroupTracker
 from trackmdp.solvers.several.group_value import evaluate_group
+from trackmdp.solvers.several.merging import make_rule
 from trackmdp.world.group import Group
 from trackmdp.world.model import World
 from trackmdp.world.problem_file import problem_bytes, problem_digest, read_problem
@@ -125,6 +128,27 @@ def test_environment_simulation_tracker_and_log_agree(tmp_path: Path) -> None:
         assert verify(reader).difference is None
 
 
+def test_a_target_that_comes_where_no_move_leads_is_followed_on() -> None:
+    """It stays where every target moves: nothing is known of its mode then, and the next move tells it again."""
+    world = ring(0.0, t_max=2)
+    tracker = GroupTracker(group_rule(Group([world]), random_table(world, 0), "union"), [0])
+    for cell, belief in ((1, [0, 1, 0]), (1, [0, 1, 0]), (2, [0, 0, 1])):
+        tracker._on = [0, 1, 2]
+        tracker.report([cell])
+        np.testing.assert_allclose(tracker.belief(), [belief])
+    tracker._on = []
+    tracker.report([None])
+    np.testing.assert_allclose(tracker.belief(), [[1, 0, 0]])
+
+
+def test_plans_of_different_memories_are_refused() -> None:
+    worlds = [ring(0.1, memory="displacement", clip=clip) for clip in (1, 2)]
+    group = Group([worlds[0], World.of(worlds[0], worlds[1].kernel, modes=2, revealed=1)])
+    tables = [random_table(world, 0) for world in worlds]
+    with pytest.raises(UserError, match="plans of different memories, expected the same"):
+        make_rule(group, tables)
+
+
 def test_a_group_is_the_same_from_its_file(tmp_path: Path) -> None:
     world = ring(0.2, memory="displacement")
     group = Group([world, World.of(world, ring(0.5).kernel, modes=2, revealed=1), world])
@@ -147,6 +171,18 @@ def test_plans_are_learned_and_solved_for_and_united(tmp_path: Path) -> None:
     again = evaluate(group, tm.load_run(tmp_path), width=0.1)
     assert run.summary["several"]["merge"] == "union"
     assert run.summary["several"]["figures"]["aihtr"]["mean"] == again.aihtr.mean
+
+
+@pytest.mark.slow
+def test_runs_of_different_memories_are_compared_in_the_same_problem(tmp_path: Path) -> None:
+    few: dict[str, Any] = {"total_frames": 1000, "frames_per_batch": 1000, "evaluation.width": 0.2}
+    for memory in ("cell", "displacement"):
+        group = Group([ring(0.1, memory=memory, clip=1)] * 2)
+        tm.train(group, folder=tmp_path / memory, **few)
+    words = [f"run={tmp_path / memory}" for memory in ("cell", "displacement")]
+    assert main(["compare", *words, f"hydra.run.dir={tmp_path / 'c'}", "quiet=true"]) == 0
+    written = json.loads((tmp_path / "c" / "comparison.json").read_text(encoding="utf-8"))
+    assert [each["name"] for each in written["policies"]] == ["cell", "displacement"]
 
 
 def test_what_modes_do_not_go_with_is_refused() -> None:

@@ -62,7 +62,7 @@ def run(cfg: CompareConfig, folder: Path, problem: Subject) -> None:
 def _digest(problem: Subject) -> str:
     """The digest of a problem, for policies of any memory."""
     if isinstance(problem, Group):
-        return problem_digest(problem)
+        return problem_digest(problem.but(memory="cell", clip=2))
     return problem_digest(replace(problem, memory="cell", clip=2))
 
 

@@ -96,25 +96,34 @@ class Beliefs:
 
     @classmethod
     def of(cls, group: Group, clocks: Clocks) -> Beliefs:
-        """At the start, where the targets that are there are located, in any of their modes alike."""
-        rows, modes = np.flatnonzero(clocks.present), group.modes
-        first = group.kind[rows % len(group)] * group.states + clocks.located.ravel()[rows] * modes
+        """At the start, where the targets that are there are located."""
+        rows = np.flatnonzero(clocks.present)
+        return cls.found(group, rows, clocks.located.ravel()[rows])
+
+    @classmethod
+    def found(cls, group: Group, rows: IndexArray, cells: IndexArray) -> Beliefs:
+        """Targets located in `cells`, in any of their modes alike."""
+        modes = group.modes
+        first = group.kind[rows % len(group)] * group.states + cells * modes
         states = (first[:, None] + np.arange(modes)).ravel()
         return cls(np.repeat(rows, modes), states, np.full(len(states), 1.0 / modes))
 
     def seen(self, group: Group, rows: IndexArray, cells: IndexArray) -> Beliefs:
         """The targets `rows` of a step's `moved` beliefs, located in `cells`.
 
-        What is known of their modes is kept. A recorded track may move as no other did.
+        What is known of their modes is kept, but where no move known leads to the cell.
         """
+        anew = Beliefs.found(group, rows, cells)
         if group.modes == 1:
-            return Beliefs.at(rows, group.kind[rows % len(group)] * group.states + cells)
-        place = among(rows, self.row)
-        here = np.flatnonzero(place[1])
-        here = here[group.cell_of(self.state[here]) == cells[place[0][here]]]
+            return anew
+        place, known = among(rows, self.row)
+        here = np.flatnonzero(known)
+        here = here[group.cell_of(self.state[here]) == cells[place[here]]]
         row, mass = self.row[here], self.mass[here]
-        total = per_row(row, mass, int(row.max(initial=-1)) + 1)
-        return Beliefs(row, self.state[here], mass / total[row])
+        total = per_row(row, mass, int(rows.max(initial=-1)) + 1)
+        lost = total[anew.row] == 0
+        rest = Beliefs(anew.row[lost], anew.state[lost], anew.mass[lost])
+        return Beliefs(row, self.state[here], mass / total[row]).joined(rest)
 
     def moved(self, group: Group) -> Beliefs:
         """After a move; masses of a row then sum to the probability that its target is in the grid."""
@@ -185,6 +194,10 @@ class Rule(ABC):
                     "tracks targets.merge=union takes one that remembers more"
                 )
         self.keys = self.tables[0].task.keys if self.tables else self.task.keys
+        if any(table.task.keys != self.keys for table in self.tables):
+            raise UserError(
+                "policy: plans of different memories, expected the same for all targets"
+            )
 
     def within(self, group: Group) -> Rule:
         """The same policy for other targets of the same task: the plans of their motions, or all in their order."""
