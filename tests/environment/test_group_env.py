@@ -10,11 +10,9 @@ from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
 import trackmdp as tm
+from tests.episodes.groups import check_steps
 from trackmdp.environment.env import TrackEnv
-from trackmdp.environment.group_dynamics import GroupDynamics
-from trackmdp.environment.group_paths import GroupPaths
 from trackmdp.errors import UserError
-from trackmdp.seeding import derive
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.solve import solve
 from trackmdp.world.group import Group
@@ -95,20 +93,7 @@ def test_union_earns_in_the_environment_what_the_joint_chain_says() -> None:
 @pytest.mark.parametrize("max_steps", [None, 6])
 def test_simulated_steps_are_those_of_the_environment_to_the_bit(max_steps: int | None) -> None:
     group = two_kinds(detection=0.7, safe_detection=0.6, safe_cost=1.5, max_steps=max_steps)
-    paths = GroupPaths(group)
-    dynamics = GroupDynamics(group.task, paths, 3)
-    for episode in tm.simulate(group, "none", 6):
-        moves, reports = (
-            torch.Generator().manual_seed(seed)
-            for seed in (episode.seed, derive(episode.seed, "report"))
-        )
-        state = dynamics.start(paths.begin(moves))
-        drawn = paths.sampler.draw(256 * 3, moves).view(-1, 3)
-        seen = torch.rand(256, 3, dtype=torch.float64, generator=reports)
-        for step, move, report in zip(episode.to_tensordict(group.task), drawn, seen, strict=False):
-            state = dynamics.advance(state, step["action"][None], move, report)
-            for key, expected in step["next"].items():
-                assert torch.equal(state[key][0], expected), key
+    check_steps(group, tm.simulate(group, "none", 6))
 
 
 def test_a_safe_action_that_misses_is_repeated() -> None:

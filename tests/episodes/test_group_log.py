@@ -12,7 +12,8 @@ import pytest
 import torch
 
 import trackmdp as tm
-from tests.episodes.logs import CONFIG, rewritten
+from tests.episodes import groups
+from tests.episodes.logs import rewritten
 from tests.solvers.test_group import tiny
 from trackmdp.app.cli import main
 from trackmdp.episodes import schema, writer
@@ -24,9 +25,7 @@ from trackmdp.episodes.messages import form_of
 from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
 from trackmdp.episodes.simulate import resimulate
-from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
-from trackmdp.solvers.several.group_tracker import GroupTracker
 from trackmdp.solvers.several.merging import Rule, make_rule
 from trackmdp.solvers.solve import solve
 from trackmdp.world.group import Group
@@ -53,11 +52,7 @@ def played(count: int, *, rule: Rule = RULE, seed: int = 0) -> list[Episode]:
 
 
 def write(file: Path, episodes: list[Episode], rule: Rule = RULE) -> Path:
-    writer = EpisodeWriter.of(file, rule.group, facts={"seed": "0"}, config=CONFIG)
-    writer.add_policy({"label": "mine"}, rule)
-    for episode in episodes:
-        writer.add(episode)
-    return writer.finish()
+    return groups.write(file, episodes, rule)
 
 
 @pytest.fixture(scope="module")
@@ -105,15 +100,7 @@ def test_rewards_and_clocks_are_those_of_the_rules() -> None:
 
 def test_a_tracker_would_have_switched_on_the_same_sensors() -> None:
     for episode in played(10):
-        tracker = GroupTracker(RULE, episode.start.tolist())
-        for t in range(len(episode)):
-            on = tracker.sensors()
-            if not tracker.safe:
-                assert on == np.flatnonzero(episode.action[t]).tolist()
-            there = episode.target[t] < 3
-            cells = np.where(episode.located[t], episode.target[t], -1).tolist()
-            gone = np.flatnonzero(~there).tolist()
-            tracker.report([None if cell < 0 else cell for cell in cells], gone=gone)
+        assert len(list(groups.tracked(RULE, episode))) == len(episode)
 
 
 def test_beliefs_are_those_of_a_filter_for_each_target() -> None:

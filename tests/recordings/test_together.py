@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,13 +18,10 @@ from trackmdp.app.cli import main
 from trackmdp.environment.env import TrackEnv
 from trackmdp.episodes.group_episodes import GroupEpisodes
 from trackmdp.episodes.reader import EpisodeReader, verify
-from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
-from trackmdp.policies.table import PolicyTable
 from trackmdp.recordings.together import Together
 from trackmdp.recordings.tracks import Recorded, Tracks
 from trackmdp.solvers.evaluate import evaluate, group_rule
-from trackmdp.solvers.several.group_tracker import GroupTracker
 from trackmdp.solvers.several.group_value import evaluate_group
 from trackmdp.solvers.several.merging import make_rule
 from trackmdp.training.evaluator import estimated_qmdp
@@ -226,68 +222,6 @@ def test_no_sensor_is_on_where_none_is_asked_for(targets: Group) -> None:
 def test_all_sensors_are_on_where_all_are_asked_for() -> None:
     targets = Group([tm.make_world(size=3)] * 2)
     assert all(each.action.all() for each in tm.simulate(targets, "all_on", 3))
-
-
-@pytest.mark.parametrize("memory", ["displacement", "displacement_gap", "two_displacements"])
-@pytest.mark.parametrize("at_once", [True, False])
-def test_each_target_has_the_plan_of_its_own_memory(
-    at_once: bool, memory: str, tmp_path: Path
-) -> None:
-    """Sets, clocks and keys followed target by target; the log and a tracker that was saved do the same."""
-    targets = several(3, memory=memory, clip=1, safe_detection=0.7)
-    assert targets.recorded is not None
-    if at_once:  # as a tracker needs it
-        tracks = replace(targets.recorded.tracks, begins=None)
-        targets = Group.of_tracks(replace(targets.recorded, tracks=tracks, held_out=tracks), 3)
-    assert targets.recorded is not None
-    assert "key" not in TrackEnv(targets, 2).observation_spec
-    keys = targets.recorded.keys
-    table = PolicyTable.from_dense(
-        targets.recorded, np.random.default_rng(2).random((keys.num_keys, 2, 9)) < 0.4
-    )
-    rule, remembered = group_rule(targets, table), 0
-    episodes = tm.simulate(targets, rule, 40)
-    for episode in episodes:
-        before = [None if cell == 9 else keys.start(cell) for cell in episode.start.tolist()]
-        n, tracker = [0] * 3, None
-        if at_once:
-            tracker = GroupTracker(rule, episode.start.tolist())
-        for t in range(len(episode)):
-            due = [k for k in range(3) if before[k] is not None and n[k] > 1]
-            expected = np.zeros(9, dtype=bool)
-            for k in range(3):
-                if before[k] is not None and not due:
-                    expected |= table.dense()[before[k], n[k]]
-            assert (episode.action[t] == expected).all()
-            if tracker is not None:
-                tracker = GroupTracker.restore(rule, json.loads(json.dumps(tracker.state())))
-                assert due or tracker.sensors() == np.flatnonzero(expected).tolist()
-                tracker.sensors()
-            now = episode.target[t].tolist()
-            for k in range(3):
-                if now[k] == 9:
-                    before[k] = None
-                elif before[k] is None:
-                    before[k], n[k] = keys.start(now[k]), 0
-                elif episode.located[t, k]:
-                    was = (np.int64(each) for each in (before[k], n[k], now[k]))
-                    before[k], n[k] = int(keys.next(*was)), 0
-                    remembered += before[k] != keys.start(now[k])
-                else:
-                    n[k] = min(n[k] + 1, 2)
-            if tracker is not None:
-                seen = [now[k] if episode.located[t, k] else None for k in range(3)]
-                tracker.report(seen, gone=[k for k in range(3) if now[k] == 9])
-    assert remembered > 100
-    assert (tracker is not None) == at_once
-    writer = EpisodeWriter.of(tmp_path / "a.mcap", targets, facts={"seed": "0"}, config="{}")
-    writer.add_policy({"label": "mine"}, rule)
-    for each in episodes.complete():
-        writer.add(each)
-    with EpisodeReader(writer.finish()) as reader:
-        assert verify(reader).difference is None
-    with pytest.raises(UserError, match=r"targets.merge=union takes one that remembers more"):
-        group_rule(targets, table, "gains")
 
 
 def test_moves_are_pooled_by_cell() -> None:

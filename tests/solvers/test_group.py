@@ -255,7 +255,7 @@ def test_a_sensor_is_on_where_all_gains_together_exceed_its_price() -> None:
     none = Policy.none(world)
     rule, apart = (make_rule(group, [none], merge) for merge in ("gains", "union"))
     seen = Clocks(np.zeros((1, 2), np.int64), np.zeros((1, 2), np.int64), np.ones((1, 2), bool))
-    moved = Beliefs.at(np.arange(2), np.zeros(2, np.int64)).moved(group)
+    moved = Beliefs.of(group, seen).moved(group)
     value = evaluate(world, none).value
     lost = world.kernel @ (1.0 + value - 1.4)
     gain, any_left = 2 * world.kernel.toarray()[0] * (1 + value - lost), 1 - 0.1**2

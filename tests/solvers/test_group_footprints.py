@@ -7,18 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 import trackmdp as tm
+from tests.episodes import groups
 from tests.solvers.test_group import best_of_all, tiny
-from trackmdp.environment.group_dynamics import GroupDynamics
-from trackmdp.environment.group_paths import GroupPaths
 from trackmdp.episodes.reader import EpisodeReader, verify
-from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
-from trackmdp.seeding import derive
 from trackmdp.solvers.several.group_bounds import sensors_suffice, upper_bound
-from trackmdp.solvers.several.group_tracker import GroupTracker
 from trackmdp.solvers.several.group_value import evaluate_group
 from trackmdp.solvers.several.merging import Beliefs, Clocks, Rule, make_rule
 from trackmdp.world.group import Group
@@ -111,7 +106,7 @@ def test_a_sensor_that_covers_both_targets_is_on_where_neither_alone_pays_for_it
     for rule, count, expected in ((alone, 1, []), (both, 2, [0])):  # .5 at .6, and 1 at .9
         zero = np.zeros((1, count), np.int64)
         seen = Clocks(zero, zero, np.ones((1, count), bool))
-        moved = Beliefs.at(np.arange(count), zero[0]).moved(rule.group)
+        moved = Beliefs.of(rule.group, seen).moved(rule.group)
         assert rule.sets(seen, moved).tolist() == expected
 
 
@@ -120,34 +115,13 @@ def test_environment_simulation_tracker_and_log_agree(tmp_path: Path) -> None:
     group = Group(
         [tiny(3, t_max=1, safe_detection=0.8, **two), tiny(4, t_max=1, safe_detection=0.8, **two)]
     )
-    rule, paths = rules(group)[0], GroupPaths(group)
-    dynamics, episodes = GroupDynamics(group.task, paths, 2), tm.simulate(group, rule, 12)
+    rule = rules(group)[0]
+    episodes = tm.simulate(group, rule, 12)
     assert sum(int(each.located.sum()) for each in episodes) > 0
+    groups.check_steps(group, episodes)
     for episode in episodes:
-        moves, reports = (
-            torch.Generator().manual_seed(seed)
-            for seed in (episode.seed, derive(episode.seed, "report"))
-        )
-        state, tracker = dynamics.start(paths.begin(moves)), GroupTracker(rule, episode.start)
-        drawn = paths.sampler.draw(256 * 2, moves).view(-1, 2)
-        seen = torch.rand(256, 2, dtype=torch.float64, generator=reports)
-        for t, step in enumerate(episode.to_tensordict(group.task)):
-            on, safe = tracker.sensors(), tracker.safe
-            assert safe or on == step["action"].nonzero().flatten().tolist()
-            state = dynamics.advance(state, step["action"][None], drawn[t], seen[t])
-            for key, expected in step["next"].items():
-                assert torch.equal(state[key][0], expected), key
-            found = [
-                int(c) if hit else None
-                for c, hit in zip(episode.target[t], episode.located[t], strict=True)
-            ]
-            tracker.report(found, gone=np.flatnonzero(episode.target[t] == 3).tolist())
-    writer = EpisodeWriter.of(tmp_path / "a.mcap", group, facts={"seed": "0"}, config="{}")
-    writer.add_policy({"label": "mine"}, rule)
-    for episode in episodes.complete():
-        writer.add(episode)
-    file = writer.finish()
-    with EpisodeReader(file) as reader:
+        assert len(list(groups.tracked(rule, episode))) == len(episode)
+    with EpisodeReader(groups.write(tmp_path / "a.mcap", episodes.complete(), rule)) as reader:
         assert verify(reader).difference is None
 
 

@@ -8,18 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 import trackmdp as tm
+from tests.episodes import groups
 from tests.solvers.test_group import best_of_all
 from trackmdp.app.cli import main
-from trackmdp.environment.group_dynamics import GroupDynamics
-from trackmdp.environment.group_paths import GroupPaths
 from trackmdp.episodes.reader import EpisodeReader, verify
-from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.seeding import derive
 from trackmdp.solvers.evaluate import evaluate, group_rule
 from trackmdp.solvers.several.group_bounds import upper_bound
 from trackmdp.solvers.several.group_tracker import GroupTracker
@@ -89,42 +85,24 @@ def test_environment_simulation_tracker_and_log_agree(tmp_path: Path) -> None:
     group = Group([world, World.of(world, ring(0.5, 0.2).kernel, modes=2, revealed=1)])
     rule = group_rule(group, tm.Policy.from_table(random_table(world, 1)))
     assert rule.name == "union"
-    paths, kernels = GroupPaths(group), [each.kernel.toarray() for each in group.worlds]
-    dynamics, episodes, found = GroupDynamics(group.task, paths, 2), tm.simulate(group, rule, 15), 0
+    kernels = [each.kernel.toarray() for each in group.worlds]
+    episodes, found = tm.simulate(group, rule, 15), 0
+    groups.check_steps(group, episodes)
     for episode in episodes:
-        moves, reports = (
-            torch.Generator().manual_seed(seed)
-            for seed in (episode.seed, derive(episode.seed, "report"))
-        )
-        state, tracker = dynamics.start(paths.begin(moves)), GroupTracker(rule, episode.start)
-        drawn = paths.sampler.draw(256 * 2, moves).view(-1, 2)
-        seen = torch.rand(256, 2, dtype=torch.float64, generator=reports)
         beliefs = [np.repeat(np.eye(3)[cell], 2) / 2 for cell in episode.start]
-        for t, step in enumerate(episode.to_tensordict(group.task)):
-            on, safe = tracker.sensors(), tracker.safe
-            assert safe or on == step["action"].nonzero().flatten().tolist()
-            state = dynamics.advance(state, step["action"][None], drawn[t], seen[t])
-            for key, expected in step["next"].items():
-                assert torch.equal(state[key][0], expected), key
-            shown, gone = list[int | None](), episode.target[t] == 3
-            chance = np.where(safe, 0.8, 0.7 * step["action"].numpy()).repeat(2)
+        forced = episode.forced(world.t_max)
+        for t, tracker in enumerate(groups.tracked(rule, episode)):
+            chance = np.where(forced[t], 0.8, 0.7 * episode.action[t]).repeat(2)
             for k, cell in enumerate(episode.target[t].tolist()):
                 hit = bool(episode.located[t, k])
-                shown.append(cell if hit else None)
                 likely = np.repeat(np.eye(3)[cell], 2) if hit else 1 - chance
-                after = beliefs[k] @ kernels[k] * (0 * chance if gone[k] else likely)
+                after = beliefs[k] @ kernels[k] * (0 * chance if cell == 3 else likely)
                 beliefs[k] = after / max(after.sum(), 1e-300)
                 found += hit
-            tracker.report(shown, gone=np.flatnonzero(gone).tolist())
-            tracker = GroupTracker.restore(rule, tracker.state())
             expected = np.stack(beliefs).reshape(2, 3, 2).sum(axis=2)
             np.testing.assert_allclose(tracker.belief(), expected, atol=1e-12)
     assert found > 50
-    writer = EpisodeWriter.of(tmp_path / "a.mcap", group, facts={"seed": "0"}, config="{}")
-    writer.add_policy({"label": "mine"}, rule)
-    for each in episodes.complete():
-        writer.add(each)
-    with EpisodeReader(writer.finish()) as reader:
+    with EpisodeReader(groups.write(tmp_path / "a.mcap", episodes.complete(), rule)) as reader:
         assert verify(reader).difference is None
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from trackmdp.arrays.numbers import whole_number
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
+from trackmdp.memory.keys import KeySpace
 from trackmdp.sensing.task import Task
 
 
@@ -102,9 +103,14 @@ class Following(ABC):
             raise UserError(f"{call}: at={at}, expected two numbers")
         return self._task.cell_of(*pair)
 
+    @property
+    def _keys(self) -> KeySpace:
+        """The keys of the policy."""
+        return self._task.keys
+
     def _facts(self) -> dict[str, Any]:
         """The facts of the task that keys and sensor ids depend on."""
-        keys = asdict(self._task.keys) | {"size": list(self._task.size)}
+        keys = asdict(self._keys) | {"size": list(self._task.size)}
         return keys | {"sensors": self._task.total_sensors}
 
     def _check_state(self, state: Any) -> None:

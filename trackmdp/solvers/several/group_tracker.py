@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
 from typing import Any, Self
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from trackmdp.arrays.numbers import whole_number
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
+from trackmdp.memory.keys import KeySpace
 from trackmdp.policies.following import Following, probabilities
 from trackmdp.solvers.several.merging import Beliefs, Clocks, Rule, followed
 
@@ -78,9 +78,12 @@ class GroupTracker(Following):
         """Whether the safe action is due, which locates all targets."""
         return bool(self._clocks.late(self._policy.task.t_max)[0])
 
+    @property
+    def _keys(self) -> KeySpace:
+        return self._policy.keys
+
     def _facts(self) -> dict[str, Any]:
-        keys = asdict(self._policy.keys) | {"size": list(self._task.size)}
-        return super()._facts() | keys | {"targets": list(self._group.targets)}
+        return super()._facts() | {"targets": list(self._group.targets)}
 
     def _given(self, call: str, cells: Any, at: Any) -> list[int | None]:
         """A cell for each target, which may be given by positions."""

@@ -85,14 +85,10 @@ class Beliefs:
     mass: Array
 
     @classmethod
-    def at(cls, row: IndexArray, state: IndexArray) -> Beliefs:
-        """Targets known to be in a state."""
-        return cls(row, state, np.ones(len(row)))
-
-    @classmethod
     def none(cls) -> Beliefs:
         """No entries, for a policy that reads none."""
-        return cls.at(*np.zeros((2, 0), dtype=np.int64))
+        nothing = np.zeros(0, dtype=np.int64)
+        return cls(nothing, nothing, np.zeros(0))
 
     @classmethod
     def of(cls, group: Group, clocks: Clocks) -> Beliefs:
