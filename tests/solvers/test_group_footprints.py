@@ -10,7 +10,7 @@ import pytest
 
 import trackmdp as tm
 from tests.episodes import groups
-from tests.solvers.test_group import best_of_all, tiny
+from tests.solvers.test_group import best_of_all, check_figures, tiny
 from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.errors import UserError
 from trackmdp.solvers.several.group_bounds import sensors_suffice, upper_bound
@@ -53,12 +53,7 @@ def check(seed: int) -> None:
     if group.task.max_steps is None and (low := tm.solve(group).lower) is not None:
         assert low <= best + 1e-9
     for rule in rules(group):
-        exact, played = evaluate_group(rule), evaluate_group(rule, episodes=3_000)
-        assert exact.exact
-        assert exact.aihtr.mean <= best + 1e-9
-        assert played.aihtr.low is not None
-        half = played.aihtr.mean - played.aihtr.low
-        assert abs(played.aihtr.mean - exact.aihtr.mean) < 2 * half + 1e-9
+        check_figures(rule, best, 3_000)
     if group.task.max_steps is None:
         for rule in rules(Group(group.worlds[:1])):
             alone = tm.evaluate(group.worlds[0], rule.tables[0]).aihtr

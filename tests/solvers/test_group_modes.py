@@ -11,7 +11,7 @@ import pytest
 
 import trackmdp as tm
 from tests.episodes import groups
-from tests.solvers.test_group import best_of_all
+from tests.solvers.test_group import best_of_all, check_figures
 from trackmdp.app.cli import main
 from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.errors import UserError
@@ -19,7 +19,6 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluate import evaluate, group_rule
 from trackmdp.solvers.several.group_bounds import upper_bound
 from trackmdp.solvers.several.group_tracker import GroupTracker
-from trackmdp.solvers.several.group_value import evaluate_group
 from trackmdp.solvers.several.merging import make_rule
 from trackmdp.world.group import Group
 from trackmdp.world.model import World
@@ -54,12 +53,7 @@ def test_brute_force_lies_between_the_policies_and_the_bound(more: dict[str, Any
     assert best <= upper_bound(group) + 1e-9
     for seed in range(3):
         rule = group_rule(group, random_table(world, seed))
-        exact, played = evaluate_group(rule), evaluate_group(rule, episodes=3_000)
-        assert exact.exact
-        assert exact.aihtr.mean <= best + 1e-9
-        assert played.aihtr.low is not None
-        half = played.aihtr.mean - played.aihtr.low
-        assert abs(played.aihtr.mean - exact.aihtr.mean) < 2 * half + 1e-9
+        check_figures(rule, best, 3_000)
 
 
 @pytest.mark.parametrize(
