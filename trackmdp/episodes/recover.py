@@ -46,7 +46,10 @@ def recover(file: Path) -> Recovered:
         if writer is None:
             lost = "its metadata or its problem are lost"
             raise UserError(f"file={file}: too damaged, {lost} ({'; '.join(damaged)})")
-        return Recovered(writer.finish(), writer.episodes, tuple(damaged))
+        try:
+            return Recovered(writer.finish(), writer.episodes, tuple(damaged))
+        finally:
+            writer.abandon()  # closes what a full disk leaves open
 
 
 def taken_over(file: Path, target: Path, policies: int) -> EpisodeWriter | None:
@@ -137,29 +140,34 @@ def _rewrite(
     # `/episode` message, which is its last one.
     parts, held = _Parts(), list[Said]()
     writer: EpisodeWriter | None = None
-    with container.opened_log(file) as stream:
-        for message in parts.messages(stream):
-            held.append(message)
-            if message[0] != "/episode":
-                continue
+    try:
+        with container.opened_log(file) as stream:
+            for message in parts.messages(stream):
+                held.append(message)
+                if message[0] != "/episode":
+                    continue
+                writer = writer or parts.begin(file, target)
+                with parts.noting():
+                    if writer is None:
+                        raise Damaged("an episode without metadata or problem")
+                    row = json.loads(message[2])
+                    # A resumed run records the episodes of later policies again.
+                    if row["policy"] >= most:
+                        break
+                    parts.add_policies(writer, row["policy"] + 1)
+                    # Messages of another episode may be held as well, one with an end that was lost.
+                    writer.add(writer.form.decode(row, held))
+                held.clear()
             writer = writer or parts.begin(file, target)
+        if held or schema.END not in parts.metadata:
+            parts.damaged.append("the end is missing")
+        if writer is not None:
+            # Policies without a whole episode too: `taken_over` counts them.
+            found = sum(name.startswith(f"{schema.POLICY}.") for name in parts.metadata)
             with parts.noting():
-                if writer is None:
-                    raise Damaged("an episode without metadata or problem")
-                row = json.loads(message[2])
-                # A resumed run records the episodes of later policies again.
-                if row["policy"] >= most:
-                    break
-                parts.add_policies(writer, row["policy"] + 1)
-                # Messages of another episode may be held as well, one with an end that was lost.
-                writer.add(writer.form.decode(row, held))
-            held.clear()
-        writer = writer or parts.begin(file, target)
-    if held or schema.END not in parts.metadata:
-        parts.damaged.append("the end is missing")
-    if writer is not None:
-        # Policies without a whole episode too: `taken_over` counts them.
-        found = sum(name.startswith(f"{schema.POLICY}.") for name in parts.metadata)
-        with parts.noting():
-            parts.add_policies(writer, int(min(found, most)))
+                parts.add_policies(writer, int(min(found, most)))
+    except BaseException:
+        if writer is not None:
+            writer.abandon()
+        raise
     return writer, parts.damaged

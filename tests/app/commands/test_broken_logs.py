@@ -123,19 +123,29 @@ def test_a_full_disk_stops_the_log_and_is_said_once(
     assert not (tmp_path / "a/episodes.mcap").exists()
 
 
+@pytest.mark.parametrize("step", ["add", "finish"])
 def test_recovering_to_a_full_disk_is_one_line_and_leaves_nothing(
-    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    step: str,
+    log: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def full(writer: EpisodeWriter, episode: Episode) -> None:
+    writers: list[EpisodeWriter] = []
+
+    def full(writer: EpisodeWriter, *_: Episode) -> None:
+        writers.append(writer)
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     file = tmp_path / "a.mcap"
     shutil.copy(log, file)
-    monkeypatch.setattr(EpisodeWriter, "add", full)
+    monkeypatch.setattr(EpisodeWriter, step, full)
     assert main(["replay", f"file={file}", "recover=true"]) == 1
     target = tmp_path / "a.recovered.mcap"
     assert capsys.readouterr().err == f"trackmdp replay: {target}: No space left on device\n"
     assert list(tmp_path.iterdir()) == [file]
+    with pytest.raises(ValueError, match="closed file"):
+        writers[0].sync()
 
 
 def test_an_evaluation_outlives_its_log(
