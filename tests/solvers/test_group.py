@@ -13,6 +13,7 @@ from tests.solvers.worlds import random_tiny_world
 from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
+from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.several import group_bounds
 from trackmdp.solvers.several.group_bounds import equal_shares, upper_bound
@@ -278,3 +279,17 @@ def test_bracket_of_two_targets_on_six_by_six_is_narrow() -> None:
     assert found.lower <= merged.aihtr.high
     assert (found.upper - merged.aihtr.mean) / group.expected_steps < 0.02
     assert upper_bound(group) == found.upper
+
+
+@pytest.mark.parametrize("modes", [1, 2])
+def test_a_budget_that_forbids_no_set_is_none(modes: int) -> None:
+    world = tiny(0)
+    kernel = np.kron(world.kernel.toarray(), np.full((modes, modes), 1 / modes))
+    free = Group([World.of(world, kernel, modes=modes)] * 2)
+    same = free.but(budget=3)
+    assert upper_bound(same) == upper_bound(free)
+    tables = [PolicyTable.all_on(each) for each in same.kinds]
+    assert evaluate_group(make_rule(same, tables, "union")).exact
+    if modes == 1:
+        assert upper_bound(free.but(budget=2)) <= upper_bound(free) < equal_shares(free)
+        assert solve(same).lower == solve(free).lower

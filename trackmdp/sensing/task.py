@@ -228,6 +228,11 @@ class Task(Carded):
         """`[S]`, whether there is a sensor."""
         return ~np.isnan(self.cost)
 
+    @property
+    def limited(self) -> bool:
+        """Whether the budget is below the number of sensors, and so forbids some sets."""
+        return self.budget is not None and self.budget < self.available.sum()
+
     @cached_property
     def paid(self) -> Array:
         """`[S]` prices of the sensors; 0 where there is none."""

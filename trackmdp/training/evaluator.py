@@ -179,7 +179,7 @@ class HeldOutEvaluator(Evaluator):
 
 def fixed_policies(task: Task) -> dict[str, PolicyTable]:
     """All sensors on, where the budget allows it, and none."""
-    all_on = {} if task.budget is not None else {"all on": PolicyTable.all_on(task)}
+    all_on = {} if task.limited else {"all on": PolicyTable.all_on(task)}
     return all_on | {"no sensors": PolicyTable.none(task)}
 
 

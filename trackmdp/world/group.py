@@ -54,8 +54,7 @@ class Group(Carded):
         for number, world in enumerate(worlds):
             of_one = {
                 f"revealed={world.revealed}": world.revealed > 1,
-                f"budget={world.budget} and modes={world.modes}": world.modes > 1
-                and world.budget is not None,
+                f"budget={world.budget} and modes={world.modes}": world.modes > 1 and world.limited,
                 f"grid.window={world.window}": world.window is not None,
                 f"task.memory={world.memory}": world.memory != "cell" and world.modes == 1,
             }

@@ -35,8 +35,8 @@ def upper_bound(group: Group) -> float:
         return math.nan
     equal = equal_shares(group)
     task = group.task
-    # Sensors are decided on one by one, and states are cells.
-    apart = task.budget is None and task.coverage is None and group.modes == 1
+    # Sensors are decided on one by one, as if there were no budget, and states are cells.
+    apart = task.coverage is None and group.modes == 1
     if len(group) != 2 or task.num_cells**2 > MOST_PAIRS or not apart:
         return equal
     one, other = group.worlds
@@ -61,7 +61,7 @@ def sensors_suffice(task: Task) -> bool:
     """Whether all sensors together do what the safe action does, are no dearer, and are allowed by the budget."""
     dear = task.safe_cost >= float(np.nansum(task.cost)) * (1.0 - 1e-12)
     everywhere = np.diff(task.sees_by_cell[:, task.available].indptr).all()
-    return dear and task.perfect and bool(everywhere) and task.budget is None
+    return dear and task.perfect and bool(everywhere) and not task.limited
 
 
 @dataclass(frozen=True, eq=False)

@@ -332,7 +332,7 @@ def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str | None = N
     modes, where a plan's worth is no sum over cells, and of one set for all that may be known, such as `none`: gains
     would make another policy of it. Else a budget needs gains.
     """
-    kinds, limited = {"gains": Merged, "union": Union}, group.task.budget is not None
+    kinds, limited = {"gains": Merged, "union": Union}, group.task.limited
     one_set = all(each.alike for each in tables) and (
         len({each.sets.indices.tobytes() for each in tables}) == 1
     )
