@@ -88,6 +88,30 @@ def test_a_state_that_does_not_fit_is_refused(change: dict[str, Any], message: s
         tm.GroupTracker.restore(three, begun().state())
 
 
+def test_a_state_of_other_footprints_is_refused() -> None:
+    world = tm.make_world("random_walk", size=2, cost=0.05)
+    covers = ([[1, 1, 0, 0], [0, 0, 1, 1]], [[1, 0, 1, 0], [0, 1, 0, 1]])
+    mine, other = (world.but(coverage=each, cost=0.1) for each in covers)
+    with pytest.raises(UserError, match=r"^state: made for .*'footprints'"):
+        tm.Tracker.restore(tm.Policy.none(other), tm.Policy.none(mine).tracker(0).state())
+    one, another = (tm.solve(tm.Group([each] * 2)) for each in (mine, other))
+    with pytest.raises(UserError, match=r"^state: made for .*'footprints'"):
+        tm.GroupTracker.restore(another.policy, one.tracker([0, 1]).state())
+
+
+def test_a_target_where_the_motion_of_another_policy_has_none_gains_nothing() -> None:
+    """Two motions on a line, to the right and to the left; a belief of the first one is taken up by the second."""
+    step = np.diag([0.5] * 3)
+    right, left = (step + np.diag([0.3, 0.3], side) for side in (1, -1))
+    mine, other = (
+        tm.solve(tm.Group([tm.World(kernel, (1, 3), cost=0.01, t_max=2)])).policy
+        for kernel in (right, left)
+    )
+    state = tm.GroupTracker(mine, [1]).state() | {"misses": [1], "belief": [[0.0, 0.0, 1.0]]}
+    assert tm.GroupTracker.restore(mine, state).sensors() == [2]
+    assert tm.GroupTracker.restore(other, state).sensors() == [1]
+
+
 def test_mistakes_with_positions_and_policies_end_in_one_line() -> None:
     tracker = begun()
     with pytest.raises(UserError, match=r"^report: no sensors\(\) since the last report"):

@@ -110,8 +110,9 @@ class Following(ABC):
 
     def _facts(self) -> dict[str, Any]:
         """The facts of the task that keys and sensor ids depend on."""
-        keys = asdict(self._keys) | {"size": list(self._task.size)}
-        return keys | {"sensors": self._task.total_sensors}
+        covers, keys = self._task.coverage, asdict(self._keys) | {"size": list(self._task.size)}
+        own = {} if covers is None else {"footprints": covers.mark}
+        return keys | {"sensors": self._task.total_sensors} | own
 
     def _check_state(self, state: Any) -> None:
         """Raise a `UserError` unless a state has the parts of this tracker's, and is of the same facts."""

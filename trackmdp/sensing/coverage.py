@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -86,6 +87,12 @@ class Coverage:
     def by_cell(self) -> sparse.csr_array:
         """`[M, S]`, the sensors that cover each cell."""
         return self.matrix.T.tocsr()
+
+    @cached_property
+    def mark(self) -> str:
+        """A digest of the cells of each sensor."""
+        parts = (self.matrix.indptr, self.matrix.indices)
+        return sha256(b"".join(each.astype(np.int64).tobytes() for each in parts)).hexdigest()[:16]
 
     def as_lists(self) -> list[list[int]]:
         """The cells of each sensor."""

@@ -296,15 +296,15 @@ class Merged(Rule):
         ]
 
     def credit(self, located: IndexArray, misses: IndexArray, state: IndexArray) -> Array:
-        """`[L]`, r + V - W of targets in `state`."""
+        """`[L]`, r + V - W of targets in `state`; 0 where only a belief by another motion has them."""
         value, worths = self._plans
-        lost, codes = np.zeros(len(state)), located * self.group.kernel.shape[0] + state
+        found, codes = np.zeros(len(state)), located * self.group.kernel.shape[0] + state
         for n, (known, worth) in enumerate(worths):
-            now = misses == n
-            place = np.searchsorted(known, codes[now])
-            assert (known[place] == codes[now]).all()
-            lost[now] = worth[place]
-        return self.task.reward + value[state] - lost
+            now = np.flatnonzero(misses == n)
+            place, there = among(known, codes[now])
+            here = now[there]
+            found[here] = self.task.reward + value[state[here]] - worth[place[there]]
+        return found
 
     def sets(self, seen: Clocks, moved: Beliefs) -> IndexArray:
         """See `Rule`."""
