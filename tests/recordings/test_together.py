@@ -136,6 +136,7 @@ def test_episodes_earn_what_the_figures_say(merge: str) -> None:
     # Every group of held-out tracks turns up among many episodes.
     episodes = tm.simulate(targets, rule, 200)
     assert isinstance(episodes, GroupEpisodes)
+    assert episodes.figures().about == "200 simulated episodes along held-out tracks, 95 %"
     played = {tuple(np.round(episodes._totals(each)[:6], 3).tolist()) for each in episodes}
     assert played == {tuple(row) for row in np.round(found.totals[:, :6], 3).tolist()}
 

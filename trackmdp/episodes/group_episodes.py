@@ -52,7 +52,8 @@ class GroupEpisodes(Episodes):
         group = self.problem
         totals = np.array([self._totals(each) for each in self]).reshape(-1, 7)
         if group.recorded is not None:
-            return GroupEvaluation(totals, False, float(totals[:, 5].mean()), None)
+            units = "simulated episode", " along held-out tracks"
+            return GroupEvaluation(totals, False, float(totals[:, 5].mean()), None, units)
         controls = group.target_steps, known_mean(self.policy)
         return GroupEvaluation(totals, False, group.expected_steps, controls)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -31,12 +31,14 @@ class GroupEvaluation(Carded):
         exact: whether they are exact.
         expected_length: steps until the last target has left, exact; on recorded tracks the mean.
         controls: exact means of the second and of the last column; None on recorded tracks, which have none.
+        units: the word for one of the units that totals are of, and what follows it; see `counted_words`.
     """
 
     totals: Array
     exact: bool
     expected_length: float
     controls: tuple[float, float] | None
+    units: tuple[str, ...] = ("simulated episode",)
 
     def _ratio(self, part: int, whole: int, *, events: bool = False) -> MeanInterval:
         if self.exact:
@@ -104,7 +106,7 @@ class GroupEvaluation(Carded):
         totals = self.totals - other.totals
         # Policies differ most in long episodes, so that the steps explain a part of any difference.
         totals[:, 1] = self.totals[:, 1]
-        return GroupEvaluation(totals, self.exact, self.expected_length, controls)
+        return replace(self, totals=totals, controls=controls)
 
     @property
     def about(self) -> str:
@@ -113,11 +115,6 @@ class GroupEvaluation(Carded):
             return "exact"
         interval = "" if self.aihtr.low is None else ", 95 %"
         return f"{counted_words(len(self.totals), *self.units)}{interval}"
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """The word for one of the units that totals are of, and what follows it; see `counted_words`."""
-        return ("simulated episode",) if self.controls else ("group", " of held-out tracks")
 
     @property
     def figures(self) -> dict[str, MeanInterval]:

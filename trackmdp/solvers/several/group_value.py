@@ -54,7 +54,8 @@ def evaluate_group(
     group = rule.group
     if group.recorded is not None:
         found = _totals(rule, _every_group(rule), 0)
-        return GroupEvaluation(found, False, float(found[:, 5].mean()), None)
+        units = "group", " of held-out tracks"
+        return GroupEvaluation(found, False, float(found[:, 5].mean()), None, units)
     exact_steps = group.expected_steps, (group.target_steps, known_mean(rule))
     if episodes is None and (exact := joint_chain(rule)) is not None:
         return GroupEvaluation(exact, True, *exact_steps)
