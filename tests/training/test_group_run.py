@@ -159,11 +159,13 @@ def test_one_targets_plan_is_learned_and_merged(merge: str, tmp_path: Path) -> N
     assert merged.exact
     assert run.summary["several"]["figures"]["aihtr"]["mean"] == merged.aihtr.mean
     assert run.evaluation.aihtr == pytest.approx(evaluate(pair.kinds[0], run.policy).aihtr)
+    for each in (run, tm.load_run(tmp_path)):  # by default as it was learned
+        assert evaluate(pair, each).aihtr == merged.aihtr
     best = evaluate(pair, solve(pair), merge="gains")
     assert run.several.merged is not None
     assert run.several.merged.aihtr.mean == best.aihtr.mean
     assert merged.aihtr.mean <= run.summary["several"]["upper"]
-    for words in ([f"targets.merge={merge}"], []):  # by default as it was learned
+    for words in ([f"targets.merge={merge}"], []):
         assert main(["evaluate", f"run={tmp_path}", *words, "quiet=true"]) == 0
         written = json.loads((tmp_path / "evaluation.json").read_text(encoding="utf-8"))
         assert written["figures"]["aihtr"]["mean"] == merged.aihtr.mean

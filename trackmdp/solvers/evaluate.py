@@ -87,11 +87,12 @@ def _of_group(
 
 
 def group_rule(group: Group, policy: Any, merge: str | None = None) -> Rule:
-    """A policy for several targets: itself, or the merged plans of single ones.
+    """A policy for several targets: itself, or the merged plans of single ones, by default as a `Run` has merged them.
 
     Raises:
         UserError: plans are of other motions, or a policy that was learned for all targets is to be merged.
     """
+    merge = merge or getattr(policy, "merge", None)
     held = policy if isinstance(policy, Rule) else getattr(policy, "policy", None)
     if not isinstance(held, Rule):
         singles = [group.single] if group.recorded else group.kinds

@@ -82,6 +82,13 @@ class Run(Carded):
         return DataFrame(self.columns)
 
     @property
+    def merge(self) -> str | None:
+        """How it puts plans for several targets together, as of `targets.merge`; None: as is usual for them."""
+        if self.several is not None:
+            return self.several.merge
+        return None if self.folder is None else load_run_config(self.folder).targets.merge
+
+    @property
     def rule(self) -> Rule:
         """The policy for the run's several targets, as its figures have it.
 
@@ -89,10 +96,9 @@ class Run(Carded):
             UserError: the run is of one target.
         """
         if self.several is not None:
-            return group_rule(self.several.group, self.policy, self.several.merge)
+            return group_rule(self.several.group, self)
         if self.folder is not None and (cfg := load_run_config(self.folder)).targets.count > 1:
-            group = group_of(problem_of(cfg, self.folder), cfg.targets.count)
-            return group_rule(group, self.policy, cfg.targets.merge)
+            return group_rule(group_of(problem_of(cfg, self.folder), cfg.targets.count), self)
         raise UserError("tracker: a run of one target, expected run.policy.tracker(cell)")
 
     def tracker(
