@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from scipy import sparse, stats
 
 from tests.helpers import random_kernel
-from trackmdp.environment.paths import RESOLUTION, PathSampler
+from tests.tracks import by_hand, recorded
+from trackmdp.environment.paths import RESOLUTION, PathSampler, path_sampler
 from trackmdp.errors import UserError
 from trackmdp.motion.chain import Motion
 
@@ -127,6 +128,13 @@ def test_a_row_that_sums_to_a_little_more_than_one_stays_in_its_row() -> None:
         assert torch.equal(moved(motion, cells, draw), cells)
     last = moved(motion, cells, LARGEST)
     assert ((last == cells) | (last == 8)).all()
+
+
+def test_as_many_recorded_points_as_cells_are_no_cells() -> None:
+    tracks = by_hand([3, 2], [1, 0])
+    sampler = path_sampler(recorded(tracks, size=2, anywhere=True))
+    assert sampler.starts == sampler.num_states == 4
+    assert sampler.cell(torch.arange(5)).tolist() == [3, 2, 1, 0, 4]
 
 
 def test_an_exited_target_stays_away() -> None:

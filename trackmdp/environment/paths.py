@@ -48,12 +48,12 @@ class PathSampler:
         states, device = motion.num_states, torch.device(device)
         self.device, self.num_states, self.modes = device, states, motion.modes
         self.starts = len(motion.first)
-        # None where episodes start in all states, where each is a cell, and where no recording stops. The tables of
-        # cells and of ends have an entry of the exit.
+        # None where episodes start in all states, where each is the cell of its number, and where no recording stops.
+        # The tables of cells and of ends have an entry of the exit.
         self._first = self._cells = self._ends = None
         if self.starts < states:
             self._first = torch.as_tensor(motion.first.astype(np.int64), device=device)
-        if not self.starts == states == num_cells:
+        if not np.array_equal(motion.cell, np.arange(num_cells)):
             cells = np.append(motion.cell.astype(np.int64), num_cells)
             self._cells = torch.as_tensor(cells, device=device)
         if motion.ends is not None:
