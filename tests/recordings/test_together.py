@@ -225,6 +225,12 @@ def test_all_sensors_are_on_where_all_are_asked_for() -> None:
     assert all(each.action.all() for each in tm.simulate(targets, "all_on", 3))
 
 
+def test_targets_may_come_from_where_no_move_is_known() -> None:
+    unknown = recorded(by_hand([0, 1]), by_hand([6, 7]))
+    episodes = tm.simulate(Group.of_tracks(unknown, 1), "none", 2).complete()
+    assert [each.belief.nnz for each in episodes] == [0, 0]
+
+
 def test_moves_are_pooled_by_cell() -> None:
     kernel = by_hand([0, 1, 2], [0, 1], [0, 0]).kernel(9).toarray()
     # Of cell 0: to 1 twice, to 0, the exit, and one exit more.

@@ -61,17 +61,18 @@ def uniform(
     )
 
 
-def joined(taken: Sequence[Columns]) -> tuple[Columns, IndexArray]:
+def joined(taken: Sequence[Columns], episodes: int = 0) -> tuple[Columns, IndexArray]:
     """Columns of steps, taken together by the running episodes `row`, as one episode after another's; their lengths.
 
     Steps were taken in order of time; a stable sort by episode leaves them so within each. Example: the rows 0 1 2,
     then 0 2, then 2 (episode 1 ended first): the order is 0 3 1 2 4 5, the sorted rows are 0 0 1 2 2 2, the lengths 2 1
-    3.
+    3. The last ones of `episodes` may have no rows.
     """
     columns = {name: np.concatenate([step[name] for step in taken]) for name in taken[0]}
     row = columns.pop("row")
     order = np.argsort(row, kind="stable")
-    return {name: column[order] for name, column in columns.items()}, np.bincount(row)
+    lengths = np.bincount(row, minlength=episodes)
+    return {name: column[order] for name, column in columns.items()}, lengths
 
 
 def narrow(column: AnyArray) -> AnyArray:

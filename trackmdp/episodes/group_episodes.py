@@ -162,7 +162,7 @@ class _Batch:
             cell = self._rule.group.cell_of(moved.state)
             taken.append({"row": episode, "place": place, "cell": cell, "mass": mass})
             rows.append(step.row)
-        columns, counts = joined(taken)
+        columns, counts = joined(taken, episodes)
         lengths = np.bincount(np.concatenate(rows), minlength=episodes).tolist()
         ends = np.cumsum(counts)[:-1]
         parts = (np.split(columns[name], ends) for name in ("place", "cell", "mass"))
