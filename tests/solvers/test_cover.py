@@ -179,9 +179,10 @@ def test_sets_are_the_best_whether_listed_or_solved_for(
 @pytest.mark.parametrize("misses", [False, True])
 @pytest.mark.parametrize("seed", range(6))
 def test_a_good_set_depends_on_no_other_row_or_candidate(
-    seed: int, misses: bool, budget: int | None
+    seed: int, misses: bool, budget: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Rows and candidates that are settled are left out of the further changes of the others."""
+    monkeypatch.setattr("trackmdp.sensing.cover._WORTH_PARTS", 0)
     rng, world = np.random.default_rng(seed), footprint_world(seed).but(budget=budget)
     choice = one_move(replace(world, detection=0.8) if misses else world)
     gain = rng.normal(0.3, 0.4, (choice.sees.shape[1], 8)) * world.kernel.data[:, None]

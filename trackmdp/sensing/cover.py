@@ -38,6 +38,8 @@ _LISTED, _MOST_SETS, _AT_ONCE = 14, 2**22, 2**18
 """Sensors of a row up to which all sets are gone through; sets of all rows, and how many at once."""
 _MOST = 2**26
 """Sensors that see the entries of a step, entry by entry: some 5 GB."""
+_WORTH_PARTS = 2**13
+"""Decisions times candidates from which on it saves time to go on with a part of them."""
 _CERTAIN = 1.0 - 2.0**-53
 """Stands for a probability of 1 where its logarithm is needed; all that is left of an entry then is 1e-16."""
 
@@ -191,9 +193,12 @@ class Shared:
 
     def _from_both(self, gain: Array, price: Array) -> BoolArray:
         """`greedy` of all the decisions."""
-        none = self._add_drop(np.zeros(price.shape, dtype=bool), gain, price)
-        every = self._add_drop(self.sees @ np.maximum(gain, 0.0) > price, gain, price)
-        return self._better(none, every, gain, price)
+        every = self.sees @ np.maximum(gain, 0.0) > price
+        # Side by side: of few candidates most of the time goes into the calls.
+        starts = np.hstack([np.zeros_like(every), every])
+        ends = self._add_drop(starts, np.hstack([gain, gain]), np.hstack([price, price]))
+        one, other = np.hsplit(ends, 2)
+        return self._better(one, other, gain, price)
 
     def _better(self, one: BoolArray, other: BoolArray, gain: Array, price: Array) -> BoolArray:
         """Of each row the set that gains more, the first where they gain the same."""
@@ -229,7 +234,7 @@ class Shared:
             on[where] = ~on[where]
             # Rows and candidates where nothing gained are settled: once the others are few, only these go on.
             moved, wide = np.flatnonzero(gains.any(axis=1)), np.flatnonzero(gains.any(axis=0))
-            if 2 * len(moved) * len(wide) < best.size:
+            if change.size > _WORTH_PARTS and 2 * len(moved) * len(wide) < best.size:
                 plans = self.rows[first[moved]]
                 kept = np.flatnonzero(among(plans, self.rows)[1])
                 entries = np.flatnonzero(np.bincount(self.sees[kept].indices))
