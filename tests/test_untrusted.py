@@ -100,12 +100,14 @@ def test_a_summary_of_900_levels_is_refused_in_one_line(tmp_path: Path) -> None:
         "3",
         b"\xff\xfa",
         "a: [",
+        "a: [" + "1," * 1000 + "1]",
     ],
 )
 def test_yaml_that_is_no_plain_mapping_is_refused_in_one_line(
     text: str | bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(untrusted, "_MOST_VALUES", 1000)
     with pytest.raises(UserError, match=r"^config.yaml: not a config \([^\n]*\)$"):
         untrusted.parse_yaml(text, "config.yaml")
     assert not list(tmp_path.iterdir())

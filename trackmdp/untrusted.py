@@ -36,7 +36,8 @@ LARGE = 2**32
 _COPIES = 2
 """Times that the bytes of an archive's arrays are in memory while it is read."""
 
-_DEEPEST = 50
+_DEEPEST, _MOST_VALUES = 50, 2**20
+"""Of a config. A value of two bytes takes 300 in memory, and seven microseconds."""
 
 
 def opened(file: Path, *, most: int, source: str = "", links: bool = False) -> BufferedReader:
@@ -172,12 +173,14 @@ def parse_yaml(text: str | bytes, source: str) -> dict[str, Any]:
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     with decoded(source, "a config"):
         depth = 0
-        for event in yaml.parse(text, Loader=loader):
+        for number, event in enumerate(yaml.parse(text, Loader=loader)):
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)
             # Nine lists of nine aliases each, ten times over, are 9^10 values in 700 bytes.
             if isinstance(event, yaml.AliasEvent) or depth > _DEEPEST:
                 raise ValueError(f"an alias, or deeper than {_DEEPEST} levels")
+            if number > _MOST_VALUES:
+                raise ValueError(f"more than {_MOST_VALUES:,} values")
         plain = yaml.load(text, Loader=loader)
         if not isinstance(plain, (dict, type(None))):
             raise ValueError("expected a mapping")
@@ -210,15 +213,21 @@ def load_npz(stream: BinaryIO) -> dict[str, npt.NDArray[Any]]:
         if any(member.comment for member in members):
             raise ValueError("a comment in its directory")
         # A member never unpacks to more than the length in the archive's directory.
-        unpacked = sum(member.file_size for member in members)
-        if unpacked > (most := min(LARGE, free_bytes() // _COPIES)):
-            raise ValueError(f"{unpacked:,} bytes when unpacked, expected at most {most:,}")
+        _check_unpacked(sum(member.file_size for member in members))
         # Each member is read to its end, where zipfile compares the checksum. Not by its name: a wrong bit may make it
         # that of another one.
-        return {
+        arrays = {
             member.filename.removesuffix(".npy"): load_npy(io.BytesIO(archive.read(member)))
             for member in members
         }
+    # Numbers of one byte become floats of eight where they are used.
+    _check_unpacked(8 * sum(array.size for array in arrays.values()))
+    return arrays
+
+
+def _check_unpacked(size: int) -> None:
+    if size > (most := min(LARGE, free_bytes() // _COPIES)):
+        raise ValueError(f"{size:,} bytes when unpacked, expected at most {most:,}")
 
 
 def load_tensors(file: Path, device: torch.device | str) -> Any:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from tests.reports.sweeps import plan
 from trackmdp.errors import UserError
+from trackmdp.reports import results
 from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.results import RESULTS, load_results, save_results
 
@@ -33,6 +35,15 @@ def test_no_path_of_the_machine_is_kept(sweep: Path, tmp_path: Path) -> None:
     plan(sweep, "a2c-0.16-0")
     save_results(gather_runs(sweep), tmp_path)
     assert load_results(tmp_path).manifest["line"] == "trackmdp train -m"
+
+
+def test_a_text_that_unpacks_to_more_than_a_large_sweep_has_is_refused(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_results(gather_runs(whole), tmp_path)
+    monkeypatch.setattr(results, "_LONGEST_TEXT", 100)
+    with pytest.raises(UserError, match="bytes of text, expected at most 100"):
+        load_results(tmp_path)
 
 
 def test_damaged_stored_results_are_refused_in_one_line(whole: Path, tmp_path: Path) -> None:

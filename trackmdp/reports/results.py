@@ -23,8 +23,8 @@ from trackmdp.world.problem_file import as_arrays, from_arrays
 RESULTS = "results.npz"
 # Raised by 1 when the meaning of the content changes: a file of another format is refused.
 FORMAT = "trackmdp results 5"
-_LARGEST = 2**30
-"""Bytes of the longest file that is read."""
+_LARGEST, _LONGEST_TEXT = 2**30, 2**26
+"""Bytes of the longest file that is read, and of its text when unpacked: twenty thousand runs."""
 
 NEEDED = ("frames", "wall_seconds", "cpu_seconds", "aihtr", "expected_length")
 """Figures of every run."""
@@ -199,7 +199,10 @@ def load_results(folder: Path) -> Results:
     file = folder / RESULTS
     with decoded(f"sweep={folder}", f"stored results that can be read ({RESULTS})"):
         arrays = load_npz(io.BytesIO(read_bytes(file, most=_LARGEST)))
-        content = json.loads(arrays.pop("text").tobytes())
+        text = arrays.pop("text").tobytes()
+        if len(text) > _LONGEST_TEXT:  # lists of nothing take twenty times the memory of their text
+            raise ValueError(f"{len(text):,} bytes of text, expected at most {_LONGEST_TEXT:,}")
+        content = json.loads(text)
         if content["format"] != FORMAT:
             raise ValueError(f"format {content['format']!r}, expected {FORMAT!r}")
         given = from_arrays(arrays)
