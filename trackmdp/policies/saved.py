@@ -120,6 +120,8 @@ def write_sets(folder: Path, policy: PolicyTable, **arrays: Array) -> dict[str, 
     Where they are `listable` the sets go to `sets.json`, unless they are drawn at random, and the arrays are returned
     as lists. Else both go to `sets.npz`, as `load_policy` reads it, and in place of each array its file is named.
     """
+    for earlier in ("sets.json", "sets.npz"):  # of another policy
+        (folder / earlier).unlink(missing_ok=True)
     file = folder / sets_name(policy)
     if file.suffix == ".npz":
         save_policy(file, policy, **arrays)

@@ -192,6 +192,9 @@ def test_without_matplotlib_there_is_no_figure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(command, "find_spec", lambda _: None)
+    earlier = tmp_path / "a/corners/99"
+    earlier.mkdir(parents=True)
     assert main(["frontier", *SMALL, "quiet=true", f"hydra.run.dir={tmp_path / 'a'}"]) == 0
+    assert not earlier.exists()
     names = {file.name for file in (tmp_path / "a").iterdir()}
     assert names == {"frontier.csv", "frontier.json", "corners"}

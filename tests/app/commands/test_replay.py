@@ -118,7 +118,8 @@ def test_every_kind_of_policy_verifies(
         "log=[mcap]",
         "episodes=15",
     ]
-    assert main([*words, "quiet=true", f"hydra.run.dir={tmp_path}"]) == 0
+    assert main([*words, f"hydra.run.dir={tmp_path}"]) == 0
+    assert ("sets in sets.json" in capsys.readouterr().out) == (baseline == "clocked")
     status, said, _ = replay(capsys, f"file={tmp_path}/episodes.mcap", "verify=true")
     assert (status, "15 episodes" in said, "the same to the bit" in said) == (0, True, True)
 

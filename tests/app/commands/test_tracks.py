@@ -130,6 +130,8 @@ def test_the_picture_follows_a_held_out_track(folder: Path) -> None:
 )
 def test_what_needs_no_motion_model_is_judged(baseline: str, sensors: float, folder: Path) -> None:
     words = ["baseline.k=2"] if baseline == "random_k" else []
+    (folder / "b").mkdir()
+    (folder / "b/sets.json").write_text("of another policy")
     assert main(["evaluate", *WORDS, f"baseline={baseline}", "hydra.run.dir=b", *words]) == 0
     figures = json.loads((folder / "b/evaluation.json").read_text())["held_out"]["figures"]
     free = (

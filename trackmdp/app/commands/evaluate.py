@@ -116,7 +116,9 @@ def _exact(
     console.print(_compared(subject, report, simulation))
     source = "run's bracket" if proved else "clocked"
     console.print(f"upper bound ({source}) {evaluator.upper:,.4f}; {score.regret}")
-    console.print(f"results in {folder}, sets in {sets_name(policy)}")
+    sets = folder / sets_name(policy)
+    listed = f", sets in {sets.name}" if sets.is_file() else ""  # not of sets drawn at random
+    console.print(f"results in {folder}{listed}")
     _log(cfg, episodes, subject, folder, console)
     return score.evaluation.aihtr
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -50,8 +51,10 @@ def run(cfg: FrontierConfig, folder: Path, world: Problem) -> None:
 
 
 def write_corners(folder: Path, found: Tradeoff) -> None:
-    """Write the sets of each corner to `folder`/NUMBER."""
+    """Write the sets of each corner to `folder`/NUMBER, in place of those of an earlier frontier."""
     own_folder(folder)
+    shutil.rmtree(folder)
+    folder.mkdir()
     for number, corner in enumerate(found.corners):
         own_folder(place := folder / f"{number}")
         write_sets(place, corner.table)
