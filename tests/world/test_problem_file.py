@@ -100,6 +100,7 @@ TWO = problem_arrays(tm.Group([small_world(), small_world(seed=1)]))
         b"PK",
         npz_bytes(ARRAYS | {"kind": np.str_("Task")}),
         npz_bytes(ARRAYS | {"t_max": np.int64(-1)}),
+        npz_bytes(ARRAYS | {"markov": np.zeros(2, dtype=bool)}),
         npz_bytes(ARRAYS | {"surplus": np.int64(1)}),
         npz_bytes(ARRAYS | {"tracks.cells": np.array([0, 1, 9, 4])}),
         npz_bytes(ARRAYS | {"tracks.cells": np.array([0, -1, 2, 4])}),

@@ -123,6 +123,8 @@ class Task(Carded):
             raise UserError(f"memory={self.memory}: expected one of {', '.join(MEMORIES)}")
         if not isinstance(self.place, Place | None):
             raise UserError(f"place: a {type(self.place).__name__}, expected a Place or None")
+        if not isinstance(self.markov, bool):
+            raise UserError(f"markov: a {type(self.markov).__name__}, expected True or False")
         size = rows, columns = grid_size(self.size)
         check_fits("size", self.size, TASK_BYTES)
         footprints = Coverage.of(self.coverage, rows * columns)
