@@ -167,6 +167,18 @@ def test_the_whole_episodes_beside_a_damaged_one_are_recovered(log: Path, tmp_pa
     read_all(saved.file)
 
 
+@pytest.mark.parametrize("read", [recover, read_all])
+def test_an_episode_larger_than_memory_is_refused(
+    read: Callable[[Path], Any], log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "a.mcap"
+    file.write_bytes(log.read_bytes())
+    monkeypatch.setattr(container, "free_bytes", lambda: 2000)
+    with pytest.raises(UserError, match=f"^file={file}: an episode of more than 1,000 bytes$"):
+        read(file)
+    assert [each.name for each in tmp_path.iterdir()] == ["a.mcap"]
+
+
 def chunk(frame: bytes, size: int, compression: str = "zstd") -> Chunk:
     return Chunk(compression, frame, 1, 0, uncompressed_crc=1, uncompressed_size=size)
 

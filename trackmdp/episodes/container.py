@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 import zlib
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack
 from io import BytesIO
 from pathlib import Path
@@ -22,7 +22,8 @@ from mcap.records import Attachment, Chunk, ChunkIndex, Metadata
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 
 from trackmdp.errors import UserError
-from trackmdp.untrusted import decoded, opened
+from trackmdp.machine import free_bytes
+from trackmdp.untrusted import LARGE, decoded, opened
 
 MAGIC = b"\x89MCAP0\r\n"
 _LARGEST_LOG, _LARGEST_RECORD, _LARGEST_CHUNK = 2**42, 2**30, 2**26
@@ -198,6 +199,20 @@ def messages_of(chunk: Chunk, topics: dict[int, str]) -> list[Said]:
             record = record_of(content[begin:end])
             topics[record.id] = record.topic
     return found
+
+
+def fitting(file: Path, messages: Iterable[Said]) -> Iterator[Said]:
+    """The messages of a log, as long as those of each episode fit into memory: a megabyte packed may be gigabytes.
+
+    Raises:
+        UserError: those of an episode do not.
+    """
+    most = left = min(LARGE, free_bytes() // 2)
+    for message in messages:
+        left = most if message[0] == "/episode" else left - len(message[2])
+        if left < 0:
+            raise UserError(f"file={file}: an episode of more than {most:,} bytes")
+        yield message
 
 
 _SIZES: dict[str, Callable[[bytes], int]] = {"": len, "zstd": zstandard.frame_content_size}

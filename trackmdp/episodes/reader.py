@@ -15,7 +15,7 @@ from tensordict import TensorDict
 
 from trackmdp.config import train_config_of
 from trackmdp.episodes import schema
-from trackmdp.episodes.container import Container, Damaged, reading
+from trackmdp.episodes.container import Container, Damaged, fitting, reading
 from trackmdp.episodes.differences import first_difference
 from trackmdp.episodes.messages import form_of
 from trackmdp.episodes.schema import versions_apart
@@ -113,7 +113,8 @@ class EpisodeReader:
         row = self.row(number)
         with reading(self.file):
             ends = int(row["start_time"]), int(row["end_time"])
-            found = self.form.decode(row, self._container.messages_around(*ends))
+            messages = fitting(self.file, self._container.messages_around(*ends))
+            found = self.form.decode(row, messages)
             if self.form.row(found, found.first_tick or 0) != row:
                 raise Damaged(f"the figures of episode {number}")
             return found

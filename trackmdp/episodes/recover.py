@@ -142,7 +142,7 @@ def _rewrite(
     writer: EpisodeWriter | None = None
     try:
         with container.opened_log(file) as stream:
-            for message in parts.messages(stream):
+            for message in container.fitting(file, parts.messages(stream)):
                 held.append(message)
                 if message[0] != "/episode":
                     continue
