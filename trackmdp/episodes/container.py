@@ -23,7 +23,7 @@ from mcap.stream_reader import StreamReader, get_chunk_data_stream
 
 from trackmdp.errors import UserError
 from trackmdp.machine import free_bytes
-from trackmdp.untrusted import LARGE, decoded, opened
+from trackmdp.untrusted import decoded, opened
 
 MAGIC = b"\x89MCAP0\r\n"
 _LARGEST_LOG, _LARGEST_RECORD, _LARGEST_CHUNK = 2**42, 2**30, 2**26
@@ -207,7 +207,7 @@ def fitting(file: Path, messages: Iterable[Said]) -> Iterator[Said]:
     Raises:
         UserError: those of an episode do not.
     """
-    most = left = min(LARGE, free_bytes() // 2)
+    most = left = free_bytes() // 2
     for message in messages:
         left = most if message[0] == "/episode" else left - len(message[2])
         if left < 0:

@@ -192,9 +192,11 @@ def test_without_matplotlib_there_is_no_figure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(command, "find_spec", lambda _: None)
-    earlier = tmp_path / "a/corners/99"
-    earlier.mkdir(parents=True)
+    earlier, own = tmp_path / "a/corners/99/sets.json", tmp_path / "a/corners/98/notes"
+    for file in (earlier, own):
+        file.parent.mkdir(parents=True)
+        file.write_text("of an earlier frontier, or of the user")
     assert main(["frontier", *SMALL, "quiet=true", f"hydra.run.dir={tmp_path / 'a'}"]) == 0
-    assert not earlier.exists()
+    assert (earlier.parent.exists(), own.exists()) == (False, True)
     names = {file.name for file in (tmp_path / "a").iterdir()}
     assert names == {"frontier.csv", "frontier.json", "corners"}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -53,8 +53,10 @@ def run(cfg: FrontierConfig, folder: Path, world: Problem) -> None:
 def write_corners(folder: Path, found: Tradeoff) -> None:
     """Write the sets of each corner to `folder`/NUMBER, in place of those of an earlier frontier."""
     own_folder(folder)
-    shutil.rmtree(folder)
-    folder.mkdir()
+    for earlier in folder.glob("[0-9]*/sets.*"):
+        earlier.unlink()
+        with suppress(OSError):  # there is something else in it
+            earlier.parent.rmdir()
     for number, corner in enumerate(found.corners):
         own_folder(place := folder / f"{number}")
         write_sets(place, corner.table)
