@@ -12,6 +12,7 @@ import pytest
 
 import trackmdp as tm
 from tests.notebook.objects import NAMES, objects, recorded
+from trackmdp.episodes import video
 from trackmdp.episodes.target_colours import shares_of
 from trackmdp.errors import UserError
 from trackmdp.notebook import drawing
@@ -120,9 +121,18 @@ def test_metrics_are_a_frame_where_pandas_is(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize("ending", ["gif", pytest.param("mp4", marks=pytest.mark.slow)])
-def test_an_episode_is_written_as_a_video(ending: str, tmp_path: Any) -> None:
-    """A frame for each step; nothing else is left in the folder."""
+def test_an_episode_is_written_as_a_video(
+    ending: str, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A frame for each step, of a .gif as soon as it is drawn; nothing else is left in the folder."""
     pytest.importorskip("imageio_ffmpeg")
+    sizes, draw = [], video._frame
+
+    def noted(*drawn: Any) -> None:
+        sizes.append(sum(each.stat().st_size for each in tmp_path.iterdir()))
+        draw(*drawn)
+
+    monkeypatch.setattr(video, "_frame", noted)
     episodes = objects()["episodes"]
     short = min(range(len(episodes)), key=lambda number: len(episodes[number]))
     file = episodes.video(tmp_path / f"a.{ending}", short, speed=10)
@@ -132,6 +142,8 @@ def test_an_episode_is_written_as_a_video(ending: str, tmp_path: Any) -> None:
 
         with Image.open(io.BytesIO(file.read_bytes())) as image:
             assert image.n_frames == len(episodes[short])
+            assert image.info["duration"] == 100
+        assert 0 == sizes[0] < sizes[-1]
     else:
         import imageio_ffmpeg
 

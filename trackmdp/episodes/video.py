@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,36 +33,63 @@ def write_video(file: Path, task: Task, episode: Episode, speed: int) -> None:
     Raises:
         UserError: another ending, or a package is missing.
     """
-    writer = _writer(file, speed)
+    if file.suffix not in (".gif", ".mp4"):
+        raise UserError(f"video: {file.name}, expected a file that ends with .gif or .mp4")
+    require("matplotlib", "video", "video")
+    if file.suffix == ".mp4":
+        require("imageio_ffmpeg", "video", "video")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     rows, columns = task.size
     figure = Figure(figsize=(min(6.4, 2 + 5.0 * columns / max(rows, columns)), 6.4), dpi=_DPI)
-    axes = figure.subplots()
+    canvas, axes = FigureCanvasAgg(figure), figure.subplots()
+
+    def drawn() -> Iterator[None]:
+        for t in range(min(len(episode), MOST_STEPS)):
+            _frame(axes, task, episode, t)
+            yield
+
     part = file.with_name(f".{file.name}.part{file.suffix}")  # whole under its name, or not at all
     with no_trace(part, file):
-        with writer.saving(figure, part, _DPI):
-            for t in range(min(len(episode), MOST_STEPS)):
-                _frame(axes, task, episode, t)
-                writer.grab_frame()
+        (_write_gif if file.suffix == ".gif" else _write_mp4)(part, drawn(), canvas, speed)
         part.replace(file)
 
 
-def _writer(file: Path, speed: int) -> Any:
-    """Matplotlib's writer for the ending."""
-    require("matplotlib", "video", "video")
-    import matplotlib
-    from matplotlib.animation import FFMpegWriter, PillowWriter
+def _write_gif(part: Path, drawn: Iterator[None], canvas: Any, speed: int) -> None:
+    """Write each frame as soon as it is drawn: only what is different from the one before, with colours of its own.
 
-    if file.suffix == ".gif":
-        return PillowWriter(speed)
-    if file.suffix != ".mp4":
-        raise UserError(f"video: {file.name}, expected a file that ends with .gif or .mp4")
-    require("imageio_ffmpeg", "video", "video")
+    PIL's `save` and matplotlib's writer keep all frames until the last one is there.
+    """
+    from PIL import Image, ImageChops
+    from PIL.GifImagePlugin import getdata, getheader
+
+    before = None
+    with part.open("wb") as stream:
+        for _ in drawn:
+            canvas.draw()
+            now = Image.fromarray(np.array(canvas.buffer_rgba())[..., :3])
+            changed = before is None or ImageChops.difference(before, now).getbbox()
+            # All of the first one; of one like the one before a pixel, so that it takes its time.
+            box = (0, 0, *now.size) if changed is True else changed or (0, 0, 1, 1)
+            image, before = now.crop(box).quantize(64), now
+            if changed is True:
+                stream.writelines(getheader(image, info={"loop": 0})[0])
+            look = {"duration": 1000 // speed, "include_color_table": True}
+            stream.writelines(getdata(image, box[:2], **look))
+        stream.write(b";")
+
+
+def _write_mp4(part: Path, drawn: Iterator[None], canvas: Any, speed: int) -> None:
     import imageio_ffmpeg
+    import matplotlib
+    from matplotlib.animation import FFMpegWriter
 
     matplotlib.rcParams["animation.ffmpeg_path"] = imageio_ffmpeg.get_ffmpeg_exe()
-    return FFMpegWriter(speed)
+    writer = FFMpegWriter(speed)
+    with writer.saving(canvas.figure, part, _DPI):
+        for _ in drawn:
+            writer.grab_frame()
 
 
 def _frame(axes: Any, task: Task, episode: Episode, t: int) -> None:
@@ -70,7 +98,12 @@ def _frame(axes: Any, task: Task, episode: Episode, t: int) -> None:
     rows, columns = task.size
     # The root, so that small probabilities show.
     shade = np.sqrt(np.minimum(episode.expected(t), 1.0)).reshape(rows, columns)
-    axes.imshow(shade, cmap="Blues", vmin=0, vmax=1.4)
+    # A mesh has the lines of the grid in it: ticks at all of them take a third of the time.
+    mesh = {"edgecolors": "#dddddd", "linewidth": 0.5, "vmin": 0, "vmax": 1.4}
+    axes.pcolormesh(range(columns), range(rows), shade, cmap="Blues", shading="nearest", **mesh)
+    axes.set(
+        xticks=[], yticks=[], aspect="equal", xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5)
+    )
     sensed: BoolArray = task.covered(episode.action[t]) & ~episode.forced(task.t_max)[t]
     down, across = np.divmod(np.flatnonzero(sensed), columns)
     area = 70_000 / max(rows, columns) ** 2
@@ -85,10 +118,6 @@ def _frame(axes: Any, task: Task, episode: Episode, t: int) -> None:
             axes.annotate(
                 f"{target}", (column + 0.2, row - 0.2), color=colour, fontsize=8, zorder=4
             )
-    axes.set_xticks(np.arange(columns + 1) - 0.5, labels=[])
-    axes.set_yticks(np.arange(rows + 1) - 0.5, labels=[])
-    axes.tick_params(length=0)
-    axes.grid(color="#dddddd", linewidth=0.5)
     outcome, _, rest = sentence(episode, t, task).partition("; ")
     axes.set_title(f"{outcome}\n{rest}", loc="left", fontsize=8, wrap=True)
     key = "blue: belief   square: sensor on   disc: target located   ring: missed"
