@@ -92,6 +92,11 @@ def test_a_long_episode_is_cut_and_the_page_says_so(
     assert MOST_STEPS == 2000
 
 
+def test_sensors_side_by_side_are_two_numbers_of_a_page() -> None:
+    (episode,) = tm.simulate(WORLD, "all_on", 1).complete()
+    assert data_of(page(WORLD, episode))["sensed"] == [[0, 16]] * len(episode)  # type: ignore[comparison-overlap]
+
+
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 def test_the_page_in_a_browser(reader: EpisodeReader, tmp_path: Path) -> None:
     number = longest(reader)
@@ -131,6 +136,12 @@ def test_the_page_in_a_browser(reader: EpisodeReader, tmp_path: Path) -> None:
             assert mark == [last_cell % 4, last_cell // 4]
             likeliest = int(np.sum(np.rint(1e4 * belief[t]) == np.rint(1e4 * belief[t].max())))
             assert browser.ask("guess.getAttribute('d').split('M').length - 1") == likeliest
+            on = [
+                f"M{cell % 4 + 0.1:.1f} {cell // 4 + 0.1:.1f}h.8v.8h-.8z"
+                for cell in episode.action[t].nonzero()[0]
+            ]
+            forced = episode.forced(WORLD.t_max)[t]
+            assert browser.ask("sensors.getAttribute('d')") == ("" if forced else "".join(on))
             if episode.target[t] < 16:
                 place = f"row {episode.target[t] // 4 + 1}, column {episode.target[t] % 4 + 1}"
                 assert place in said

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from trackmdp.arrays.types import BoolArray
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.target_colours import COLOURS
 from trackmdp.sensing.task import Task
@@ -75,7 +76,7 @@ def _content(problem: Subject, episode: Episode) -> dict[str, Any]:
             "reward": episode.reward[shown].tolist(),
             "total": episode.returns[shown].tolist(),
             "on": episode.action[shown].sum(axis=1).tolist(),
-            "sensed": [row.nonzero()[0].tolist() for row in task.covered(episode.action[shown])],
+            "sensed": [_runs(row) for row in task.covered(episode.action[shown])],
             "frame": "sensor on" if task.coverage is None else "cell sensed",
         }
     )
@@ -106,6 +107,11 @@ def _of_target(episode: Episode, task: Task) -> dict[str, Any]:
         "n": episode.misses[shown].tolist(),
         "belief": [_sparse(row) for row in episode.belief[shown]],
     }
+
+
+def _runs(sensed: BoolArray) -> list[int]:
+    """First cell of a run of sensed ones, the first after it, and so on: of 1 1 0 1 they are 0, 2, 3, 4."""
+    return np.flatnonzero(np.diff(sensed, prepend=False, append=False)).tolist()
 
 
 def _sparse(belief: Any) -> list[int]:
