@@ -132,6 +132,17 @@ def test_piped_a_line_comes_for_each_change_until_all_are_over(
     ]
 
 
+def test_at_a_terminal_that_cannot_redraw_lines_come_as_piped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TERM", "dumb")
+    sweep = sweep_of(tmp_path / "s", "a")
+    with ExitStack() as running:
+        running.enter_context(locked(begin(sweep / "a", "20,2000,30.0,4.0\n")))
+        lines = said(sweep, monkeypatch, running.close, terminal=True).splitlines()
+    assert lines[0] == "a: running, 20 %, gap 20.00, 16 s left"
+
+
 def test_without_a_sweep_that_runs_there_is_nothing_to_wait_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

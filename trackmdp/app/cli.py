@@ -93,7 +93,10 @@ def _dispatch(words: list[str]) -> int:
                 "Windows is not supported: expected Linux or macOS, or Linux in WSL on Windows"
             )
         return _run(command, words[1:])
-    # Named one by one: SystemExit passes, with which argparse ends after `--version`.
+    except SystemExit as error:
+        if not (status := _signalled(error)):  # with which argparse ends after `--version`
+            raise
+        return _report(command, Preempted(status - 128))
     except (Exception, KeyboardInterrupt, Preempted) as error:
         # Standard output has no file's name. If it has failed, it fails once more, which `main` reports.
         if isinstance(error, OSError) and not error.filename:

@@ -71,7 +71,7 @@ def watch(sweep: Path, console: Console, every: float) -> None:
     found = first = next(looks)
     if not found:
         raise UserError(f"sweep={sweep}: no runs in there, expected the folder of a sweep")
-    if console.is_terminal:
+    if console.is_terminal and not console.is_dumb_terminal:
         # `auto_refresh=False`: a thread would draw between two looks at the disk.
         with Live(_table(found, console.height), console=console, auto_refresh=False) as live:
             for found in looks:

@@ -181,16 +181,13 @@ def test_a_signal_while_logging_names_the_part_and_how_to_save_it(
         signal.raise_signal(number)
         raise AssertionError
 
-    words, status = [*LOGGED, f"hydra.run.dir={tmp_path / 'my runs'}"], 0
+    words = [*LOGGED, f"hydra.run.dir={tmp_path / 'my runs'}"]
     with monkeypatch.context() as patch:
         patch.setattr(EpisodeWriter, "finish", stopped)
-        try:
-            status = main(words)
-        except SystemExit as ended:  # without a line of its own
-            status = ended.code
-    assert status == 128 + number
+        assert main(words) == 128 + number
     said, *last = capsys.readouterr().err.splitlines()
-    assert last == (["trackmdp evaluate: interrupted"] if number is signal.SIGINT else [])
+    why = "interrupted" if number is signal.SIGINT else "stopped by signal 15"
+    assert last == [f"trackmdp evaluate: {why}"]
     part = tmp_path / "my runs" / "episodes.mcap.part"
     assert said.startswith(f"trackmdp evaluate: {part}: cut off")
     assert main(shlex.split(said.split("`")[1])[1:]) == 0
