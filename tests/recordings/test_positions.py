@@ -20,6 +20,7 @@ from trackmdp.recordings.positions import (
     NO_POSITION,
     REPEATED,
     Positions,
+    frame_positions,
     sumo,
 )
 from trackmdp.recordings.track_files import read_positions
@@ -119,6 +120,12 @@ def test_ads_b_by_its_usual_columns(tmp_path: Path) -> None:
     """`track` is a heading there, and 4e5 an id."""
     found = read(tmp_path, ADSB)
     assert rows(found) == [(0, 0, NOON, 8.5, 47.5), (0, 0, NOON + 5, 8.5, 47.6), (1, 1, NOON, 2, 1)]
+
+
+def test_seconds_may_be_texts() -> None:
+    """Not years, which pandas takes 1000 and 1060 for."""
+    table = pd.DataFrame({"id": "a", "time": ["1000", "1060", "1060.5"], "x": 0.0, "y": 0.0})
+    assert frame_positions(table).time.tolist() == [1000, 1060, 1060.5]
 
 
 def test_parquet_is_as_csv(tmp_path: Path) -> None:

@@ -147,6 +147,9 @@ def _seams(lon: Array, x: Array, y: Array) -> np.ndarray:
 def _utm(x: Array, y: Array, source: str) -> str:
     """The code of the UTM zone in which the median position lies."""
     low, high = np.percentile(x, (1, 99))
+    if high - low > 180.0:  # across the line at which 179 is followed by -179: here by 181
+        x = x % 360.0
+        low, high = np.percentile(x, (1, 99))
     latitude = float(np.median(y))
     if high - low > _WIDEST or abs(latitude) > 84:
         raise UserError(
@@ -155,8 +158,7 @@ def _utm(x: Array, y: Array, source: str) -> str:
         )
     # Zones of 6 degrees from 180 W on: 8.5 E is in 1 + floor(188.5 / 6) = 32. The code of the north serves the south
     # too, where y is then negative: only differences count here.
-    zone = min(60, 1 + int((float(np.median(x)) + 180.0) // 6.0))
-
+    zone = 1 + int((float(np.median(x)) + 180.0) // 6.0) % 60
     return f"EPSG:326{zone:02d}"
 
 

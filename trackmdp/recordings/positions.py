@@ -115,7 +115,7 @@ def table_of(
     return Positions(**columns, **are, dropped={**(dropped or {}), **counts})
 
 
-def _number(column: Any, name: str) -> Any:
+def _number(column: Any, name: str, expected: str = "a number") -> Any:
     """The numbers of a column, which `name` names where it has no name of its own.
 
     Raises:
@@ -125,7 +125,7 @@ def _number(column: Any, name: str) -> Any:
 
     series = pd.Series(column)
     found = pd.to_numeric(series, errors="coerce").astype(np.float64)
-    _refuse_entry(series, found, name, "a number")
+    _refuse_entry(series, found, name, expected)
     return found
 
 
@@ -151,16 +151,18 @@ def _seconds(column: Any) -> Any:
 
     if pd.api.types.is_numeric_dtype(column) or column.isna().all():
         return _number(column, "time")
-    first = str(column.dropna().iloc[0])
+    first = column.dropna().iloc[0]
+    # Seconds as texts, as of a file read without types; else 2000 would be a year.
+    if isinstance(first, str) and pd.notna(pd.to_numeric(first, errors="coerce")):
+        return _number(column, "time", "seconds or a time")
     # ISO 8601, as nearly all have it, or 31/12/2024 23:59:59 as the Danish AIS has it. Other orders of day and month
     # are not guessed.
-    form = "%d/%m/%Y %H:%M:%S" if first[2:3] == "/" else "ISO8601"
+    form = "%d/%m/%Y %H:%M:%S" if str(first)[2:3] == "/" else "ISO8601"
     try:
         stamps = pd.to_datetime(column, utc=True, format=form)
     except (TypeError, ValueError):
         dated = pd.to_datetime(column, utc=True, format=form, errors="coerce")
-        seconds = pd.to_numeric(column, errors="coerce")
-        _refuse_entry(column, seconds.where(dated.isna(), 0.0), "time", "seconds or a time")
+        _refuse_entry(column, dated, "time", "seconds or a time")
         raise
     return (stamps - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
 
