@@ -6,8 +6,12 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from trackmdp.errors import UserError
+
+if TYPE_CHECKING:
+    import torch
 
 SIZE_PATTERN = r"[0-9]+(\.[0-9]+)?([KMGT]iB|B)?"
 """Sizes of memory as text: bytes, or with a unit of powers of 1,024."""
@@ -100,3 +104,25 @@ def _number(file: Path) -> int | None:
         return None
     # Version 2 writes `max` where there is no limit.
     return int(text) if text.isdigit() else None
+
+
+def make_device(name: torch.device | str, key: str = "device") -> torch.device:
+    """The torch device called `name`; `auto` is the first GPU where there is one.
+
+    Raises:
+        UserError: there is no such device here.
+    """
+    import torch
+
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if name == "auto":
+        return torch.device("cuda:0" if count else "cpu")
+    try:
+        device = torch.device(name)
+        if device.type != "cuda" or (device.index or 0) < count:
+            return device
+    except (RuntimeError, TypeError):  # no name of a device, or an index that is no C integer
+        pass
+    raise UserError(
+        f"{key}={name}: no such device here ({count} CUDA devices found); use cpu or auto"
+    )

@@ -22,19 +22,22 @@ def whole_seed(seed: int) -> int:
     """The seed of a user.
 
     Raises:
-        UserError: it is no whole number.
+        UserError: it is no whole number from 0 on.
     """
     try:
-        return operator.index(seed)  # int() would cut 1.5 to 1
+        number = operator.index(seed)  # int() would cut 1.5 to 1
     except TypeError:
-        raise UserError(f"seed={seed}: expected an integer") from None
+        number = -1
+    if number < 0:
+        raise UserError(f"seed={seed}: expected an integer >= 0")
+    return number
 
 
 def derive(seed: int, *names: str | int) -> int:
     """A 63-bit seed for the stream called `names`, for example ``derive(0, "world", 3)``.
 
     Raises:
-        UserError: `seed` is no whole number.
+        UserError: `seed` is no whole number from 0 on.
     """
     # Hashed, so that neighbouring seeds and names give unrelated streams: with seed + worker, worker 1 of run 0 and
     # worker 0 of run 1 would draw the same numbers. `>> 1` leaves 63 bits, which fit a signed 64-bit integer.

@@ -276,6 +276,22 @@ def test_a_batch_size_that_is_none_is_named(wrong: Any) -> None:
 
 
 @pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: TrackEnv(small_world(), device="x"), "device=x: no such device here"),
+        (lambda: TrackEnv(small_world()).to("x"), "device=x: no such device here"),
+        (lambda: TrackEnv(small_world(), seed=-1), "seed=-1: expected an integer >= 0"),
+        (lambda: TrackEnv(small_world()).set_seed(-1), "seed=-1: expected an integer >= 0"),
+    ],
+)
+def test_a_device_that_is_not_here_and_a_seed_that_is_none_are_named(
+    wrong: Callable[[], object], message: str
+) -> None:
+    with pytest.raises(UserError, match=message):
+        wrong()
+
+
+@pytest.mark.parametrize(
     "kind", [torch.float32, torch.float64, torch.bfloat16, torch.uint8, torch.int8, torch.int64]
 )
 def test_an_action_of_any_type_is_the_same_step(kind: torch.dtype) -> None:

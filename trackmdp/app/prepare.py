@@ -221,7 +221,7 @@ def _check_here(cfg: CommandConfig, folder: Path) -> None:
             newest(Path(cfg.init_from), "init_from")
     if {*devices.values()} != {"cpu"}:  # torch takes seconds
         with importing():
-            from trackmdp.training.devices import make_device
+            from trackmdp.machine import make_device
 
         for key, name in devices.items():
             make_device(name, key)

@@ -20,6 +20,7 @@ from trackmdp.environment.dynamics import FLAGS, State
 from trackmdp.environment.render import picture
 from trackmdp.environment.tracking import Snapshot, Tracking
 from trackmdp.errors import UserError
+from trackmdp.machine import make_device
 from trackmdp.sensing.actions import checked_action
 from trackmdp.sensing.task import Task
 from trackmdp.world.group import Group, check_problem
@@ -77,8 +78,9 @@ class TrackEnv(EnvBase):
         device: device of the tensors.
 
     Raises:
-        UserError: `world` is no world, or `batch_size` no shape; in `step`, an action has another shape, other
-            values or more sensors on than the budget, or there was no reset before.
+        UserError: `world` is no world, `batch_size` no shape, `seed` no integer from 0 on, or there is no such
+            `device`; in `step`, an action has another shape, other values or more sensors on than the budget, or
+            there was no reset before.
 
     Example:
         >>> from trackmdp import TrackEnv, make_world
@@ -99,7 +101,7 @@ class TrackEnv(EnvBase):
         # A reset leaves no row done. Without the option TorchRL 0.14.1 looks whether one is after each reset, with an
         # `if` on a tensor (`_reset_check_done`), which no graph of `torch.compile` can hold.
         super().__init__(
-            device=torch.device(device), batch_size=_shape(batch_size), allow_done_after_reset=True
+            device=make_device(device), batch_size=_shape(batch_size), allow_done_after_reset=True
         )
         task: Task = world.single
         self._world = world
@@ -121,7 +123,7 @@ class TrackEnv(EnvBase):
     def to(self, device: torch.device | str) -> Self:
         """Move the targets as they stand; draws begin anew from the seed, as each device has generators of its own."""
         before, state = self.device, self._tracking.state
-        super().to(device)
+        super().to(make_device(device))
         if self.device != before:
             self._make_tracking(self._seed)
             self._tracking.state = {key: each.to(self.device) for key, each in state.items()}
@@ -191,8 +193,8 @@ class TrackEnv(EnvBase):
         self._carried = (*observed, *FLAGS)
 
     def _set_seed(self, seed: int | None) -> None:
+        self._tracking.seed(seed or 0, self._stream)
         self._seed = seed or 0
-        self._tracking.seed(self._seed, self._stream)
 
     def snapshot(self) -> dict[str, dict[str, Tensor]]:
         """The state of all targets `[num_envs, ...]` and of the generators, for a checkpoint."""

@@ -17,9 +17,9 @@ from trackmdp.config.learning import CollectorConfig, WorkersConfig
 from trackmdp.config.registry import maker
 from trackmdp.environment.env import TrackEnv
 from trackmdp.errors import RunError, message_of
+from trackmdp.machine import make_device
 from trackmdp.seeding import seed_global
 from trackmdp.solvers.workers import end_with_parent, starting
-from trackmdp.training.devices import make_device
 from trackmdp.world.group import Subject
 
 MakeEnv: TypeAlias = "partial[TrackEnv]"

@@ -21,26 +21,6 @@ from trackmdp.machine import free_bytes, gib
 from trackmdp.sensing.task import Task
 
 
-def make_device(name: str, key: str = "device") -> torch.device:
-    """The torch device called `name`; `auto` is the first GPU where there is one.
-
-    Raises:
-        UserError: there is no such device here.
-    """
-    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if name == "auto":
-        return torch.device("cuda:0" if count else "cpu")
-    try:
-        device = torch.device(name)
-        if device.type != "cuda" or (device.index or 0) < count:
-            return device
-    except RuntimeError:  # an index that is no C integer
-        pass
-    raise UserError(
-        f"{key}={name}: no such device here ({count} CUDA devices found); use cpu or auto"
-    )
-
-
 def check_memory(cfg: TrainConfig, task: Task, device: torch.device) -> str:
     """One line about the memory that the run needs and the memory free on `device`.
 

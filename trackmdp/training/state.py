@@ -16,9 +16,9 @@ from trackmdp.algos.common import Algorithm
 from trackmdp.config import CheckpointConfig, TrainConfig
 from trackmdp.config.tree import flatten
 from trackmdp.errors import Preempted, UserError
+from trackmdp.machine import make_device
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Position, Row, Training
-from trackmdp.training.devices import make_device
 from trackmdp.training.inputs import identity
 from trackmdp.untrusted import decoded
 from trackmdp.world.group import Subject

@@ -16,13 +16,14 @@ from trackmdp.algos.common import make_algorithm
 from trackmdp.config import TrainConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import Preempted, RunError
+from trackmdp.machine import make_device
 from trackmdp.policies.policy import Policy
 from trackmdp.seeding import seed_global
 from trackmdp.signals import Signals, Watch
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Position, Row, Training
 from trackmdp.training.collect import make_collector
-from trackmdp.training.devices import check_memory, make_device
+from trackmdp.training.devices import check_memory
 from trackmdp.training.display import Display
 from trackmdp.training.evaluator import Score, while_collecting
 from trackmdp.training.folders import SUMMARY

@@ -28,6 +28,7 @@ from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.player import draw_picture
 from trackmdp.episodes.simulate import simulate
 from trackmdp.episodes.simulated_figures import Simulation
+from trackmdp.machine import make_device
 from trackmdp.notebook.card import counted_words
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import sets_name, write_sets
@@ -40,7 +41,6 @@ from trackmdp.solvers.several.group_bounds import upper_bound
 from trackmdp.solvers.several.group_figures import with_ends
 from trackmdp.solvers.several.group_value import evaluate_group
 from trackmdp.solvers.solve import baseline_policy
-from trackmdp.training.devices import make_device
 from trackmdp.training.display import FIGURES, make_console, show_held_out, table
 from trackmdp.training.evaluator import CELL_ALONE, ExactEvaluator, HeldOutEvaluator
 from trackmdp.training.folders import SUMMARY, check_files, read_summary
