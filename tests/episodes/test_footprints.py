@@ -90,7 +90,7 @@ def test_a_page_counts_sensors_and_frames_what_they_see(tmp_path: Path) -> None:
         )
     assert content is not None
     said = json.loads(content[1])
-    assert (said["on"][0], said["sensed"][0], said["frame"]) == (1, [0, 1, 3], "cell sensed")
+    assert (said["on"][0], said["sensed"][0], said["frame"]) == (1, [0, 2, 3, 4], "cell sensed")
 
 
 def test_beliefs_leave_out_what_was_covered(tmp_path: Path) -> None:

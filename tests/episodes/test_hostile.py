@@ -122,6 +122,7 @@ CASES: dict[str, Callable[[Parts], Any]] = {
     "index of {}": lambda parts: parts["a"].update({INDEX: [{}]}),
     "index is a number": lambda parts: parts["a"].update({INDEX: 3}),
     "step": lambda parts: parts["x"]["/step"][0][1].update(target="x"),
+    "last cell": lambda parts: parts["x"]["/step"][0][1].update(last_cell=-1),
     "grid": lambda parts: parts["x"]["/grid"][0][1].update(data="!!"),
     "reward 10^39": lambda parts: parts["x"]["/step"][0][1].update(reward=1e39),
     "start": lambda parts: parts["a"][INDEX][0].update(start=16),

@@ -144,7 +144,11 @@ class Form:
         places = [(each["episode"], each["t"]) for each in said]
         if counts != {row["length"]} or places != [(row["episode"], t) for t in range(len(said))]:
             raise UserError(f"episode={row['episode']}: its steps do not fit together")
-        return self._episode(row, said, mine)
+        found = self._episode(row, said, mine)
+        # Most of what a step says for viewers follows from the rest of it.
+        if [json.loads(step) for step in self.steps(found)] != said:
+            raise UserError(f"episode={row['episode']}: figures of its steps do not fit together")
+        return found
 
     def _episode(
         self, row: dict[str, Any], said: list[dict[str, Any]], mine: dict[str, list[bytes]]
