@@ -94,14 +94,14 @@ def test_a_cluster_that_is_joined_is_asked_for_no_resources() -> None:
     assert ray_options("local", 3)["num_cpus"] == 3
 
 
-@pytest.mark.parametrize("error", [RuntimeError, OSError, None])
+@pytest.mark.parametrize("error", [RuntimeError, Exception, OSError, None])
 def test_sigterm_that_ray_took_over_acts_as_before(error: type[Exception] | None) -> None:
     def begin() -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         if error is not None:
             raise error
 
-    told = {RuntimeError: UserError, OSError: OSError, None: None}[error]
+    told = OSError if error is OSError else error and UserError
     message = "x=null: expected a Ray cluster" if told is UserError else None
     before = signal.getsignal(signal.SIGTERM)
     try:

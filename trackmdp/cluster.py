@@ -34,7 +34,11 @@ def joining(key: str, address: str | None) -> Iterator[None]:
         # present current folder first on its workers' path: a `random.py` there would run in them.
         with kept(signal.SIGTERM), safe_children(), chdir(Path(__file__).parents[1]):
             yield
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except Exception as error:
+        # Ray raises a bare `Exception` where a node does not start in time.
+        expected = isinstance(error, (ConnectionError, ValueError, RuntimeError))
+        if not expected and type(error) is not Exception:
+            raise
         given, why = "null" if address is None else address, reason(error)
         raise UserError(f"{key}={given}: expected a Ray cluster ({why})") from error
 
