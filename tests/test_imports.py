@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -103,3 +104,23 @@ def test_ctrl_c_before_and_after_the_command_shows_no_traceback(moment: str, sta
 def test_commands_leave_it_on() -> None:
     assert main(["train", "grid.size=0"]) == 2
     assert gc.isenabled() and gc.get_freeze_count() > 0
+
+
+@pytest.mark.slow
+def test_with_warnings_as_errors_a_run_is_not_stopped_by_torchrls_own(tmp_path: Path) -> None:
+    words = "train algo.total_frames=1000 algo.frames_per_batch=1000 grid.size=3"
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-W",
+            "error",
+            "-m",
+            "trackmdp",
+            *words.split(),
+            f"hydra.run.dir={tmp_path}",
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")

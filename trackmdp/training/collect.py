@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import warnings
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
@@ -10,7 +11,6 @@ from typing import Any, TypeAlias
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
 
 from trackmdp.config import TrainConfig
 from trackmdp.config.learning import CollectorConfig, WorkersConfig
@@ -21,6 +21,20 @@ from trackmdp.machine import make_device
 from trackmdp.seeding import seed_global
 from trackmdp.solvers.workers import end_with_parent, starting
 from trackmdp.world.group import Subject
+
+with warnings.catch_warnings():
+    # TorchRL 0.14.1 warns of its own classes while it is imported: with `python -W error` nothing could be learned.
+    warnings.simplefilter("ignore", DeprecationWarning)
+    from torchrl.collectors import (
+        BaseCollector as BaseCollector,
+    )
+    from torchrl.collectors import (
+        Collector as Collector,
+    )
+    from torchrl.collectors import (
+        MultiAsyncCollector,
+        MultiSyncCollector,
+    )
 
 MakeEnv: TypeAlias = "partial[TrackEnv]"
 """Makes the environments that are stepped together; `stream` is the one argument left open."""

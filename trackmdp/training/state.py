@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torchrl.collectors import BaseCollector, Collector
 
 from trackmdp.algos.common import Algorithm
 from trackmdp.config import CheckpointConfig, TrainConfig
@@ -19,6 +18,7 @@ from trackmdp.errors import Preempted, UserError
 from trackmdp.machine import make_device
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Position, Row, Training
+from trackmdp.training.collect import BaseCollector, Collector
 from trackmdp.training.inputs import identity
 from trackmdp.untrusted import decoded
 from trackmdp.world.group import Subject
