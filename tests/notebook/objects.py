@@ -34,8 +34,12 @@ def objects() -> dict[str, Any]:
     run = tm.train(world, "model_based", seed=3, **SHORT)
     solution = tm.solve(world)
     tradeoff = tm.frontier(tm.make_world("drift", size=3), resolution=0.1)
+    group = tm.Group([world, tm.make_world("random_walk", size=(3, 4), cost=0.16)])
     return {
         "world": world,
+        "group": group,
+        "group_episodes": tm.simulate(group, "all_on", 2),
+        "group_evaluation": tm.evaluate(group, "none", width=0.1),
         "hidden": headings(),
         "recorded": recorded(),
         "task": world.task,
@@ -55,6 +59,9 @@ def objects() -> dict[str, Any]:
 
 NAMES = (
     "world",
+    "group",
+    "group_episodes",
+    "group_evaluation",
     "hidden",
     "recorded",
     "task",

@@ -19,7 +19,7 @@ from trackmdp.notebook import drawing
 from trackmdp.notebook.pictures import Heat, Lines, picture_of
 
 pyplot = pytest.importorskip("matplotlib.pyplot")
-WITHOUT = {"task", "episode", "comparison", "mixture"}
+WITHOUT = {"task", "episode", "comparison", "mixture", "group_evaluation"}
 """Objects without a picture; all prices of the task are the same."""
 
 

@@ -153,7 +153,7 @@ class TrackEnv(EnvBase):
             row: number of the target, the batch flattened.
 
         Raises:
-            UserError: another mode, or a row that is not there.
+            UserError: another mode, a row that is not there, several targets, or there was no reset before.
         """
         if mode not in ("rgb_array", "text") or not 0 <= row < self.num_envs:
             raise UserError(

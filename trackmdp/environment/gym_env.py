@@ -103,7 +103,8 @@ class TrackGym(_Tracked, gymnasium.Env[Observation, npt.NDArray[np.int8]]):
 
     An observation has the keys of `TrackEnv`, `action_history` as a `Box` of 0 and 1; an action is a `MultiBinary(K)`:
     the sensors to switch on; those that `action_space` draws keep to the budget. Stable-Baselines3 reads it with its
-    `MultiInputPolicy`, TorchRL with `GymEnv`.
+    `MultiInputPolicy`, TorchRL with `GymEnv`. The sets of Stable-Baselines3 are bits of their own, which do not keep to
+    a budget: there, leave it out.
 
     Args:
         world: the world, recorded tracks or a group of targets; None to make one of `options`.
@@ -113,7 +114,7 @@ class TrackGym(_Tracked, gymnasium.Env[Observation, npt.NDArray[np.int8]]):
     Raises:
         TypeError: an option is unknown.
         UserError: both a world and options are given, or one of them is wrong; in `step`, an action has another shape
-            or values other than 0 and 1.
+            or values other than 0 and 1, or more sensors on than the budget.
     """
 
     metadata: dict[str, Any] = {"render_modes": list(_MODES), "render_fps": 4}  # noqa: RUF012, Gymnasium's own form

@@ -44,8 +44,10 @@ class GroupEpisodes(Episodes):
         if len(self) > 1:
             found = self.figures()
             for name in ("aihtr", "accuracy", "sensors_per_step", "safe_per_step"):
-                facts[name.replace("_", " ")] = with_ends(getattr(found, name))
-        return Card(f"Episodes: {len(self):,} (figures: 95 % intervals)", facts)
+                facts[name.replace("_", " ").replace("aihtr", "AIHTR")] = with_ends(
+                    getattr(found, name)
+                )
+        return Card(f"GroupEpisodes: {len(self):,} (figures: 95 % intervals)", facts)
 
     def figures(self) -> GroupEvaluation:  # type: ignore[override]
         """The policy's figures from the episodes, with 95 % intervals."""

@@ -67,16 +67,17 @@ def _episodes(episodes: Any) -> Picture | None:
     """The path of the first target, over the share of steps in which each cell is sensed."""
     if not len(episodes):
         return None
-    task, some = episodes.problem, episodes[:20]
+    task, some = episodes.problem.task, episodes[:20]
     steps = sum(len(each) for each in some)
     sensed = sum(task.covered(each.action[~each.forced(task.t_max)]).sum(axis=0) for each in some)
-    first = some[0]
-    inside = first.target < task.num_cells
-    path = [first.start, *first.target[inside].tolist()]
-    hollow = [False, *(~first.located[inside]).tolist()]
+    first = next(some[0].singles())
+    # Of several targets one may come later, another one leave before the others.
+    path, located = np.append(first.start, first.target), np.append(True, first.located)
+    inside = path < task.num_cells
     values = (sensed / steps).reshape(task.size)
     title = "path of the first target; filled: located, hollow: missed"
-    return Heat(title, values, "share of steps in which a cell is sensed", (), path, hollow)
+    label = "share of steps in which a cell is sensed"
+    return Heat(title, values, label, (), path[inside].tolist(), (~located[inside]).tolist())
 
 
 def _run(run: Any) -> Picture:
@@ -161,8 +162,9 @@ _MAKERS: dict[str, Callable[[Any], Picture | None]] = {
     "summary": _run,
     "corners": _tradeoff,
     "bound": _solution,
-    "sensors_per_step": _values,
+    "starts": _values,
     "deterministic": _policy,
+    "kinds": lambda group: picture_of(group.single),
     "held_out": _tracks,
     "kernel": _motion,
     "t_max": _prices,

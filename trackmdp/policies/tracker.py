@@ -100,7 +100,7 @@ class Tracker(Following):
 
     @property
     def safe(self) -> bool:
-        """See `Following`."""
+        """Whether the safe action is due: all sensors on."""
         return self.misses > self._task.t_max and not self._exited
 
     def belief(self) -> Array:
@@ -157,7 +157,7 @@ class Tracker(Following):
         self._exited, self._on = True, None
 
     def state(self) -> dict[str, Any]:
-        """See `Following`."""
+        """All that is needed to go on later, as JSON takes it; see `restore`."""
         numbers = {name: getattr(self, name) for name in _NUMBERS}
         belief = None if self._filter is None else self._belief[0].tolist()
         own = {"on": self._on, "exited": self._exited, "belief": belief}

@@ -134,9 +134,7 @@ class GroupEvaluation(Carded):
         """The figures with their intervals."""
         facts = {name.replace("_", " "): with_ends(each) for name, each in self.figures.items()}
         facts["steps per episode"] = decimal(self.expected_length, 1)
-        return Card(
-            f"Evaluation of several targets: {self.about}", {"AIHTR": facts.pop("aihtr")} | facts
-        )
+        return Card(f"GroupEvaluation: {self.about}", {"AIHTR": facts.pop("aihtr")} | facts)
 
 
 def with_ends(found: MeanInterval) -> str:

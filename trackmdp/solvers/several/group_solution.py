@@ -82,4 +82,4 @@ class GroupSolution(Carded):
             "proved from below": decimal(self.lower, 4) if self.lower is not None else "no",
             "seconds": f"{self.seconds:.2g}",
         }
-        return Card(f"Solution for several targets: {grid_words(self.group.task.size)}", facts)
+        return Card(f"GroupSolution: {grid_words(self.group.task.size)}", facts)

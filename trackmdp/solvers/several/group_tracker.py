@@ -155,7 +155,7 @@ class GroupTracker(Following):
         self._clocks, self._beliefs, self._on = clocks, beliefs, None
 
     def state(self) -> dict[str, Any]:
-        """See `Following`."""
+        """All that is needed to go on later, as JSON takes it; see `restore`."""
         past = self._clocks.history
         return {
             "task": self._facts(),
