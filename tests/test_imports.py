@@ -109,18 +109,6 @@ def test_commands_leave_it_on() -> None:
 @pytest.mark.slow
 def test_with_warnings_as_errors_a_run_is_not_stopped_by_torchrls_own(tmp_path: Path) -> None:
     words = "train algo.total_frames=1000 algo.frames_per_batch=1000 grid.size=3"
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-W",
-            "error",
-            "-m",
-            "trackmdp",
-            *words.split(),
-            f"hydra.run.dir={tmp_path}",
-        ],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = [sys.executable, "-W", "error", "-m", "trackmdp", *words.split()]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")

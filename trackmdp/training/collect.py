@@ -25,16 +25,7 @@ from trackmdp.world.group import Subject
 with warnings.catch_warnings():
     # TorchRL 0.14.1 warns of its own classes while it is imported: with `python -W error` nothing could be learned.
     warnings.simplefilter("ignore", DeprecationWarning)
-    from torchrl.collectors import (
-        BaseCollector as BaseCollector,
-    )
-    from torchrl.collectors import (
-        Collector as Collector,
-    )
-    from torchrl.collectors import (
-        MultiAsyncCollector,
-        MultiSyncCollector,
-    )
+    from torchrl import collectors as collectors
 
 MakeEnv: TypeAlias = "partial[TrackEnv]"
 """Makes the environments that are stepped together; `stream` is the one argument left open."""
@@ -47,7 +38,7 @@ def make_collector(
     device: torch.device,
     *,
     done: int = 0,
-) -> BaseCollector:
+) -> collectors.BaseCollector:
     """The source of the frames that are left, from the config's collector.
 
     Args:
@@ -84,7 +75,7 @@ def single(
     cfg: CollectorConfig,  # noqa: ARG001
     common: dict[str, Any],
     done: int,  # noqa: ARG001
-) -> BaseCollector:
+) -> collectors.BaseCollector:
     """A collector of batches `[B, time]` in this process; its frames are env steps.
 
     Args:
@@ -97,17 +88,17 @@ def single(
     # Trajectory numbers are read by no learner here, take a tenth of the collecting time, and would be one more state
     # to save. A buffer would be copied out for every batch: without one each batch is stacked once and is the caller's.
     once = {"use_buffers": False, "return_same_td": True}
-    return Collector(env(), policy, track_traj_ids=False, **once, **common)
+    return collectors.Collector(env(), policy, track_traj_ids=False, **once, **common)
 
 
 def _in_workers(
-    kind: Callable[..., BaseCollector],
+    kind: Callable[..., collectors.BaseCollector],
     env: MakeEnv,
     policy: TensorDictModuleBase,
     cfg: WorkersConfig,
     common: dict[str, Any],
     done: int,
-) -> BaseCollector:
+) -> collectors.BaseCollector:
     """A collector of TorchRL's `kind` in worker processes; arguments as for `single`.
 
     Raises:
@@ -132,9 +123,11 @@ def not_started(cfg: WorkersConfig, error: Exception) -> RunError:
 
 
 # By default the batches of the workers are stacked, `[workers, B, time]`, which a learner would take for `[B, time]`.
-multi_sync = partial(_in_workers, partial(MultiSyncCollector, cat_results=0, use_buffers=True))
+multi_sync = partial(
+    _in_workers, partial(collectors.MultiSyncCollector, cat_results=0, use_buffers=True)
+)
 """Every batch is collected by all of the workers: `[B, time]`, their rows one after the other."""
-multi_async = partial(_in_workers, MultiAsyncCollector)
+multi_async = partial(_in_workers, collectors.MultiAsyncCollector)
 """Every batch is collected by the worker that has it ready."""
 
 

@@ -18,7 +18,7 @@ from trackmdp.errors import Preempted, UserError
 from trackmdp.machine import make_device
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Position, Row, Training
-from trackmdp.training.collect import BaseCollector, Collector
+from trackmdp.training.collect import collectors
 from trackmdp.training.inputs import identity
 from trackmdp.untrusted import decoded
 from trackmdp.world.group import Subject
@@ -44,7 +44,7 @@ def capture(trainer: Training, folder: Path) -> dict[str, Any]:
         "algorithm": trainer.algorithm.state_dict(),
         # None for collectors in worker processes: their environments cannot be saved and begin new episodes.
         "collector": {"environment": collector.env.snapshot()}
-        if isinstance(collector, Collector)
+        if isinstance(collector, collectors.Collector)
         else None,
         "random": {"cpu": torch.get_rng_state(), "cuda": cuda},
         "position": vars(trainer.position),
@@ -59,10 +59,12 @@ def _versions(cfg: TrainConfig) -> dict[str, str]:
     return {name: version(name) for name in (*PACKAGES, "trackmdp")} | kinds
 
 
-def restore(state: Mapping[str, Any], algorithm: Algorithm, collector: BaseCollector) -> Position:
+def restore(
+    state: Mapping[str, Any], algorithm: Algorithm, collector: collectors.BaseCollector
+) -> Position:
     """Put a captured state back, the random generators last; call after everything has been built."""
     algorithm.load_state_dict(state["algorithm"])
-    if state["collector"] is not None and isinstance(collector, Collector):
+    if state["collector"] is not None and isinstance(collector, collectors.Collector):
         # Private, but in no state_dict of TorchRL: the observations with which the next batch begins, rows in
         # mid-episode. An episode's end is not among them, for the environment has begun the next one in that row.
         collector._carrier.update(collector.env.restore(state["collector"]["environment"]))
