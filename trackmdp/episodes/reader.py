@@ -108,13 +108,13 @@ class EpisodeReader:
             raise UserError(f"episode={number}: {self.file} holds {len(self)} episodes ({ends})")
         return self._rows[number]
 
-    def read(self, number: int) -> Any:
-        """Episode `number`, of one target or of several."""
+    def read(self, number: int, *, whole: bool = False) -> Any:
+        """Episode `number`, of one target or of several; for `whole` see `Form.decode`."""
         row = self.row(number)
         with reading(self.file):
             ends = int(row["start_time"]), int(row["end_time"])
             messages = fitting(self.file, self._container.messages_around(*ends))
-            found = self.form.decode(row, messages)
+            found = self.form.decode(row, messages, whole=whole)
             if self.form.row(found, found.first_tick or 0) != row:
                 raise Damaged(f"the figures of episode {number}")
             return found
@@ -204,7 +204,7 @@ def verify(reader: EpisodeReader, *, numbers: list[int] | None = None) -> Verifi
             some = mine[begin : begin + at_once]
             again = resimulate(world, policy, [int(row["seed"]) for row in some]).complete()
             for row, one in zip(some, again, strict=True):
-                logged = reader.read(row["episode"])
+                logged = reader.read(row["episode"], whole=True)
                 # A simulated episode does not know under which policy it was logged.
                 mended = replace(one, policy=row["policy"])
                 if difference := first_difference(logged, mended, belief_tolerance=tolerance):
