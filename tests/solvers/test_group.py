@@ -11,6 +11,7 @@ import pytest
 import trackmdp as tm
 from tests.solvers.worlds import random_tiny_world
 from trackmdp.arrays.types import Array, IndexArray
+from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.table import PolicyTable
@@ -293,3 +294,9 @@ def test_a_budget_that_forbids_no_set_is_none(modes: int) -> None:
     if modes == 1:
         assert upper_bound(free.but(budget=2)) <= upper_bound(free) < equal_shares(free)
         assert solve(same).lower == solve(free).lower
+
+
+def test_united_sets_are_simulated_without_beliefs(monkeypatch: pytest.MonkeyPatch) -> None:
+    rule = make_rule(Group([tiny(0)] * 2), [PolicyTable.all_on(tiny(0))], "union")
+    monkeypatch.delattr(Beliefs, "moved")
+    assert len(evaluate_group(rule, episodes=5).totals) == len(simulate(rule.group, rule, 5)) == 5

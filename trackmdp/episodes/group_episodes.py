@@ -114,8 +114,8 @@ class _Batch:
         self._seen = uniform(seeds, "report", targets)
 
     @torch.no_grad()
-    def _steps(self) -> Iterator[GroupStep]:
-        return group_steps(self._rule, self._walks, self._reports)
+    def _steps(self, *, predicted: bool) -> Iterator[GroupStep]:
+        return group_steps(self._rule, self._walks, self._reports, predicted=predicted)
 
     def _reports(self, row: IndexArray, step: int) -> Array:
         """`[E, K]` draws of the reports."""
@@ -127,7 +127,7 @@ class _Batch:
         """Columns of `GroupEpisodes`, stepped until the last target has left, or until the last step allowed."""
         walks, cell = self._walks, self._rule.group.cell_of(self._walks.state)
         start = np.where(walks.inside, cell, self._task.num_cells).astype(np.int64)
-        columns, length = joined([self._taken(step) for step in self._steps()])
+        columns, length = joined([self._taken(step) for step in self._steps(predicted=False)])
         return columns | {"start": start, "length": length}
 
     def _taken(self, step: GroupStep) -> Columns:
@@ -157,7 +157,7 @@ class _Batch:
         """`[T · K, M]`, predicted in each step of each episode; see `Episode`."""
         (episodes, targets), cells = self._shape, self._task.num_cells
         taken, rows = list[Columns](), list[IndexArray]()
-        for t, step in enumerate(self._steps()):
+        for t, step in enumerate(self._steps(predicted=True)):
             moved = step.moved
             episode, target = np.divmod(moved.row, targets)
             place, mass = target + t * targets, moved.mass.astype(np.float32)

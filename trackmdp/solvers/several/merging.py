@@ -167,7 +167,9 @@ class Rule(ABC):
 
     name = ""
     reads_history = False
-    """Whether it reads the sets of the last steps, in place of beliefs."""
+    """Whether it reads the sets of the last steps."""
+    reads_beliefs = False
+    """Whether it reads where the targets may be."""
 
     @property
     def remembers(self) -> bool:
@@ -270,6 +272,7 @@ class Merged(Rule):
     """Gains of all targets, added up for each sensor."""
 
     name = "gains"
+    reads_beliefs = True
 
     @cached_property
     def _plans(self) -> tuple[Array, list[tuple[IndexArray, Array]]]:

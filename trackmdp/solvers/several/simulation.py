@@ -72,7 +72,7 @@ class GroupStep:
 
 
 def group_steps(
-    rule: Rule, targets: Moving, draws: Uniform, *, predicted: bool = True
+    rule: Rule, targets: Moving, draws: Uniform, *, predicted: bool
 ) -> Iterator[GroupStep]:
     """The steps of all episodes, until the last target of the last one has left, or to the last step allowed.
 
@@ -88,7 +88,7 @@ def group_steps(
     for number in itertools.count() if task.max_steps is None else range(task.max_steps):
         if not len(row := np.flatnonzero(clocks.present.any(axis=1))):
             return
-        moved = beliefs.moved(group) if predicted or not rule.reads_history else Beliefs.none()
+        moved = beliefs.moved(group) if predicted or rule.reads_beliefs else Beliefs.none()
         late = clocks.late(task.t_max)
         on = rule.sets(clocks, moved)
         on = on[~late[on // sensors]]
