@@ -45,6 +45,14 @@ def test_every_cell_is_a_square_with_its_value_and_its_sensors(
         assert np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) > 0
 
 
+def test_across_180_degrees_the_squares_lie_side_by_side() -> None:
+    place = ON_A_MAP | {"origin": (179.99, -17.0), "crs": "EPSG:32660"}
+    policy = tm.solve(tm.make_world("drift", size=(3, 4), **place), "qmdp").policy
+    rings = [each["geometry"]["coordinates"][0] for each in map_features(policy)["features"]]
+    lon = np.array(rings)[..., 0]
+    assert lon.max() > 180 and np.ptp(lon) < 0.03
+
+
 def test_the_command_writes_the_same(tmp_path: Path) -> None:
     words = ["grid.size=4", "grid.cell=500", "grid.origin=[8.5,47.0]", "grid.crs=EPSG:2056"]
     few = ["algo=model_based", "algo.total_frames=2000", "algo.frames_per_batch=1000"]

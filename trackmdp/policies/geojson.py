@@ -30,9 +30,14 @@ def map_features(policy: PolicyTable, value: Array | None = None) -> dict[str, A
     """
     task, place = policy.task, checked_place(policy)
     keys = task.keys.start(np.arange(task.num_cells), 0)
+    # Across 180 degrees longitudes go on beyond it: a square from 179.9 to -179.9 would be drawn around the world.
+    middle = place.outline(task.rows // 2 * task.columns + task.columns // 2, task.size)[0][1]
     features = []
     for cell, key in enumerate(keys.tolist()):
-        corners = [(lon, lat) for lat, lon in place.outline(cell, task.size)]
+        corners = [
+            (lon - 360.0 * round((lon - middle) / 360.0), lat)
+            for lat, lon in place.outline(cell, task.size)
+        ]
         worth = math.nan if value is None else float(value[cell])
         row, column = divmod(cell, task.columns)
         about: dict[str, Any] = {"cell": cell, "row": row, "column": column}
