@@ -103,8 +103,8 @@ class TrackGym(_Tracked, gymnasium.Env[Observation, npt.NDArray[np.int8]]):
 
     An observation has the keys of `TrackEnv`, `action_history` as a `Box` of 0 and 1; an action is a `MultiBinary(K)`:
     the sensors to switch on; those that `action_space` draws keep to the budget. Stable-Baselines3 reads it with its
-    `MultiInputPolicy`, TorchRL with `GymEnv`. The sets of Stable-Baselines3 are bits of their own, which do not keep to
-    a budget: there, leave it out.
+    `MultiInputPolicy`, TorchRL with `GymEnv`. Neither knows of a budget, and sets beyond it are refused: with one, take
+    `TrackEnv`.
 
     Args:
         world: the world, recorded tracks or a group of targets; None to make one of `options`.
