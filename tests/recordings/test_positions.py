@@ -128,6 +128,11 @@ def test_seconds_may_be_texts() -> None:
     assert frame_positions(table).time.tolist() == [1000, 1060, 1060.5]
 
 
+def test_a_column_of_missing_times_holds_none() -> None:
+    table = pd.DataFrame({"id": "a", "time": [pd.NaT, pd.NaT], "x": [0.0, 1.0], "y": 0.0})
+    assert np.isnan(frame_positions(table).time).all()
+
+
 def test_parquet_is_as_csv(tmp_path: Path) -> None:
     times = pd.to_datetime(["2024-05-01T12:00:05", "2024-05-01T12:00:00"])
     table = pd.DataFrame({"id": [3, 3], "time": times, "x": [1, 2.5]})

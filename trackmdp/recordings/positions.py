@@ -124,7 +124,7 @@ def _number(column: Any, name: str, expected: str = "a number") -> Any:
     import pandas as pd
 
     series = pd.Series(column)
-    found = pd.to_numeric(series, errors="coerce").astype(np.float64)
+    found = pd.to_numeric(series, errors="coerce").where(series.notna()).astype(np.float64)
     _refuse_entry(series, found, name, expected)
     return found
 
@@ -149,15 +149,14 @@ def _seconds(column: Any) -> Any:
     """
     import pandas as pd
 
-    if pd.api.types.is_numeric_dtype(column) or column.isna().all():
-        return _number(column, "time")
-    first = column.dropna().iloc[0]
-    # Seconds as texts, as of a file read without types; else 2000 would be a year.
-    if isinstance(first, str) and pd.notna(pd.to_numeric(first, errors="coerce")):
+    first = column.dropna().iloc[:1]
+    seconds = first.dtype.kind not in "mM" and pd.to_numeric(first, errors="coerce").notna().all()
+    # Also as texts, as of a file read without types: else 2000 would be a year.
+    if seconds or first.empty:
         return _number(column, "time", "seconds or a time")
     # ISO 8601, as nearly all have it, or 31/12/2024 23:59:59 as the Danish AIS has it. Other orders of day and month
     # are not guessed.
-    form = "%d/%m/%Y %H:%M:%S" if str(first)[2:3] == "/" else "ISO8601"
+    form = "%d/%m/%Y %H:%M:%S" if str(first.iloc[0])[2:3] == "/" else "ISO8601"
     try:
         stamps = pd.to_datetime(column, utc=True, format=form)
     except (TypeError, ValueError):
