@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from tests.helpers import BORDERS
-from trackmdp.arrays.entries import row_sums
+from trackmdp.arrays.entries import distinct, row_sums
 from trackmdp.errors import UserError
 from trackmdp.motion.kernels import load_table, random_support, random_walk
 from trackmdp.world.model import World
@@ -115,3 +115,8 @@ def test_memory_follows_the_support() -> None:
     tracemalloc.stop()
     assert peak < 200e6
     assert world.kernel.nnz <= 5 * 256**2
+
+
+@pytest.mark.parametrize(("given", "once"), [([5, -1, 5, 0], [-1, 0, 5]), ([], []), ([7], [7])])
+def test_numbers_in_order_each_once(given: list[int], once: list[int]) -> None:
+    assert distinct(np.array(given, dtype=np.int32)).tolist() == once

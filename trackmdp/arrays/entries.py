@@ -91,6 +91,13 @@ def ranks(rows: IndexArray) -> IndexArray:
     return np.arange(len(rows)) - np.searchsorted(rows, rows)
 
 
+def distinct(numbers: IndexArray) -> Any:
+    """The numbers in order, each once: of 2 0 2 they are 0 2."""
+    # Since NumPy 2.3 np.unique hashes integers, which takes ten to a hundred times as long as to sort them.
+    ordered = np.sort(numbers)
+    return ordered[np.diff(ordered, prepend=ordered[:1] - 1) != 0]
+
+
 def among(known: IndexArray, wanted: IndexArray) -> tuple[IndexArray, BoolArray]:
     """Where `wanted` numbers are among `known` ones, which are in order, and whether they are; in their shape."""
     # With 37 and 41, 41 is at place 1, and so is 38, another number. The place of 50 would be 2: beyond the last.

@@ -21,7 +21,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.entries import ones_at, row_index
+from trackmdp.arrays.entries import distinct, ones_at, row_index
 from trackmdp.arrays.types import BoolArray, IndexArray
 from trackmdp.config.by_blocks import PartitionConfig
 from trackmdp.errors import UserError
@@ -107,7 +107,7 @@ def sensing_blocks(world: World, side: int, halo: int) -> list[Block]:
 def sensors_of(world: World, seen: Rectangle) -> IndexArray:
     """Numbers of the sensors that cover a cell of a rectangle, in order."""
     cells = cells_of(seen, world.columns)
-    return cells if world.coverage is None else np.unique(world.coverage.by_cell[cells].indices)
+    return cells if world.coverage is None else distinct(world.coverage.by_cell[cells].indices)
 
 
 def sub_world(world: World, seen: Rectangle) -> World:

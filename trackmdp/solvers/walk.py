@@ -18,7 +18,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.entries import ends_of, index_type, per_row
+from trackmdp.arrays.entries import among, distinct, ends_of, index_type, per_row
 from trackmdp.arrays.types import Array, BoolArray, IndexArray, Indices
 from trackmdp.memory.keys import KeySpace
 from trackmdp.motion.chain import Motion
@@ -229,14 +229,14 @@ def all_events(
         if not task.safe:
             parts.append(forced_codes(keys, motion.num_states, states, states))
         return Events(keys, motion.num_states, np.concatenate(parts))
-    known = frontier = np.unique(started(keys, motion, motion.first))
+    known = frontier = distinct(started(keys, motion, motion.first))
     if motion.ends is not None:
         return _along_tracks(task, motion, Events(keys, motion.num_states, known), reports)
     while len(frontier):
         events = Events(keys, motion.num_states, frontier)
-        after = np.unique(np.concatenate(list(_following(task, motion, events, reports))))
-        frontier = np.setdiff1d(after, known, assume_unique=True)
-        known = np.union1d(known, frontier)
+        after = distinct(np.concatenate(list(_following(task, motion, events, reports))))
+        frontier = after[~among(known, after)[1]]
+        known = np.sort(np.concatenate([known, frontier]))
     return Events(keys, motion.num_states, known)
 
 
@@ -256,12 +256,12 @@ def _along_tracks(task: Task, motion: Motion, starts: Events, reports: Reports |
     for now in range(int(step.max()) + 1):
         here = steps_of(later) <= now
         some = np.concatenate([later[here], *begun[now : now + 1]])
-        frontier = np.unique(some)
+        frontier = distinct(some)
         known.append(frontier)
         if len(frontier):
             events = Events(starts.keys, starts.states, frontier)
             found = [later[~here], *_following(task, motion, events, reports)]
-            later = np.unique(np.concatenate(found))
+            later = distinct(np.concatenate(found))
     return Events(starts.keys, starts.states, np.sort(np.concatenate(known)))
 
 

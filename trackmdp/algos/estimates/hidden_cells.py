@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from trackmdp.arrays.entries import among
+from trackmdp.arrays.entries import among, distinct
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.grid.displacements import cell_at
 from trackmdp.recordings.tracks import Tracks
@@ -87,7 +87,7 @@ class Moves:
         number, inside = self.shift(before, after), after < self._cells
         sensed = ~(unknown[at] | unknown[at + 1])
         sensed |= not sensed.any()
-        self.moves = np.unique(np.append(number[sensed & inside], 0))
+        self.moves = distinct(np.append(number[sensed & inside], 0))
         possible = ~inside | np.isin(number, self.moves)
         at, before, after = at[possible], before[possible], after[possible]
         codes = self._codes(before, self.headings(line)[at], after)

@@ -25,7 +25,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.entries import among, per_row
+from trackmdp.arrays.entries import among, distinct, per_row
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.policies.saved import packed
@@ -237,7 +237,7 @@ class Rule(ABC):
             row = (key * self.task.num_choices + seen.misses)[episode, target]
             on = table.written[row].tocoo()
             found.append(episode[on.row] * self.sensors + on.col)
-        return np.unique(np.concatenate(found))
+        return distinct(np.concatenate(found))
 
     def packed(self) -> list[dict[str, Any]]:
         """The arrays from which it is made again, of each kind."""
