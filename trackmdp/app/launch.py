@@ -244,8 +244,11 @@ def answer(compose: Composer, args: argparse.Namespace) -> bool:
                 hydra.hydra_help(None, _parser(), args)
             elif compose.words == ["install=bash"]:
                 sys.stdout.write(bash([*ROOTS, "example"]))
-            else:
+            elif compose.words == ["query=bash"]:
                 hydra.shell_completion(compose.name, compose.words)
+            else:  # Hydra's own scripts know no commands
+                given = " ".join(compose.words)
+                raise UserError(f"--shell-completion {given}: expected install=bash or query=bash")
         except Exception as error:  # of many kinds; all are about the command line
             raise UserError(message_of(error)) from error
     sys.stdout.write(answered.getvalue())
@@ -281,6 +284,5 @@ def _parser() -> argparse.ArgumentParser:
     how = "show how the config is composed"
     one_of("--info", "-i", const="all", nargs="?", choices=_INFO, help=how)
     one_of("--hydra-help", action="store_true", help="Hydra's help")
-    completing = "install=bash, uninstall=bash, query=bash"
-    one_of("--shell-completion", "-sc", action="store_true", help=completing)
+    one_of("--shell-completion", "-sc", action="store_true", help="install=bash, query=bash")
     return parser
