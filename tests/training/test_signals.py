@@ -103,10 +103,12 @@ def test_before_training_a_signal_leaves_no_folder(
     number: signal.Signals,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(place, lambda *_: signal.raise_signal(number))
     folder = tmp_path / "a" / "b"
-    with handled(lambda *_: None, number), pytest.raises(SystemExit) as ended:
-        main(["train", "grid.size=3", "quiet=true", *f"{words}{folder}".split()])
-    assert ended.value.code == 128 + number
+    with handled(lambda *_: None, number):
+        status = main(["train", "grid.size=3", "quiet=true", *f"{words}{folder}".split()])
+    assert status == 128 + number
+    assert capsys.readouterr().err == f"trackmdp train: stopped by signal {int(number)}\n"
     assert not folder.parent.exists()

@@ -129,7 +129,11 @@ class Tracks:
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class Recorded(Task):
-    """A task with recorded tracks in place of a motion model.
+    """A task with recorded tracks in place of a motion model; `load_tracks` makes one of a file.
+
+    Args:
+        size: N of an N x N grid, or (rows, columns).
+        **of_task: as of `World`.
 
     Attributes:
         tracks: those to learn from.
