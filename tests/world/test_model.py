@@ -52,8 +52,9 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
         UserError, match=r"cost: 3 values, expected one number or 4 \(one per cell\)"
     ):
         Task(2, cost=np.zeros(3), safe_cost=1.0, t_max=0)
-    with pytest.raises(UserError, match=r"cost: 'prices.csv', expected numbers"):
-        Task(2, cost="prices.csv")
+    for cost in ("prices.csv", np.full(4, 0.1 + 1j)):
+        with pytest.raises(UserError, match=r"cost: .*, expected numbers"):
+            Task(2, cost=cost)
     for size in (2.0, None):
         with pytest.raises(UserError, match=f"size={size}: expected an integer >= 1"):
             Task(size, cost=0.1)  # type: ignore[arg-type]

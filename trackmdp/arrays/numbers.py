@@ -79,6 +79,8 @@ def one_each(
         UserError: another number of numbers, or one out of range.
     """
     try:
+        if np.iscomplexobj(given):  # would lose their imaginary part
+            raise TypeError
         values, rows = np.asarray(given, dtype=np.float64), ""
     except (TypeError, ValueError):
         raise UserError(f"{source}: {given!r:.40}, expected numbers") from None
