@@ -179,6 +179,8 @@ def test_a_mean_budget_gives_two_policies_and_how_often_to_draw_each(tmp_path: P
     )
     assert content["lower"] == pytest.approx(content["upper"], rel=1e-5)
     assert (tmp_path / "mean_budget" / "1" / "sets.json").is_file()
+    assert main(words) == 0
+    assert not (tmp_path / "mean_budget.json").exists()
     assert main([*words, "cost.mean_budget=9"]) == 0
     content = json.loads((tmp_path / "mean_budget.json").read_text(encoding="utf-8"))
     assert content["binding"] is False

@@ -27,6 +27,7 @@ from trackmdp.world.group import Group
 from trackmdp.world.model import World
 from trackmdp.world.problem import Problem, check_sensors, modelled
 
+_MEAN_BUDGET = "mean_budget.json"
 _BOUNDS = {"paper": bounds.paper, "valid": bounds.valid, "clocked": bounds.clocked}
 
 
@@ -48,6 +49,7 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem) -> float:
     with reporting(console, f"solve {cfg.solver.name}") as show:
         solution = run_solver(world, cfg.solver, show, cfg.partition)
     bound = {name: float(each(world).mean()) for name, each in _BOUNDS.items()}
+    (folder / _MEAN_BUDGET).unlink(missing_ok=True)  # of another policy
     arrays = write_sets(folder, solution.table, value=solution.value, upper_value=solution.bound)
     write_json(folder / "solution.json", _report(cfg, solution, bound) | arrays)
     _show(console, cfg.solver.name, world, solution, bound, folder)
@@ -146,9 +148,9 @@ def _on_average(
     at: Console, cfg: SolveConfig, world: World, solution: Solution, most: float, folder: Path
 ) -> None:
     """The best policies with `most` sensors per step on average: `mean_budget.json`, and the sets of the corners."""
-    path, price = "mean_budget.json", float(np.nanmin(world.cost))
+    path, price = folder / _MEAN_BUDGET, float(np.nanmin(world.cost))
     if solution.evaluation.sensors_per_step <= most:
-        write_json(folder / path, {"sensors": most, "binding": False})
+        write_json(path, {"sensors": most, "binding": False})
         at.print(f"cost.mean_budget={most:g}: the policy above has fewer sensors per step")
         return
     with reporting(at, f"cost.mean_budget={most:g}") as show:
@@ -160,7 +162,7 @@ def _on_average(
     # The bound on policies of any number of sensors may be the smaller one where a search was cut.
     upper = max(value, min(found.worth(most, price), solution.upper))
     own = {"sensors": most, "binding": True, "lower": value, "upper": upper}
-    write_json(folder / path, own | mixture_report(mixture, found))
+    write_json(path, own | mixture_report(mixture, found))
     write_corners(folder / "mean_budget", found)
     show_mixture(at, f"cost.mean_budget={most:g}", mixture, found)
     at.print(
