@@ -253,10 +253,14 @@ def test_its_belief_is_that_of_the_log(name: str) -> None:
 def test_belief_needs_a_motion() -> None:
     with pytest.raises(UserError, match=r"belief\(\): the motion is not known"):
         begun().belief()
-    with pytest.raises(UserError, match="expected a World of 3 x 3 cells"):
-        begun(world=WORLD)
-    with pytest.raises(UserError, match="expected a World of 3 x 3 cells and 9 sensors"):
-        begun(world=World(np.eye(9) * 0.9, 3, cost=0.1, coverage=np.ones((2, 9))))
+    for footprints in (np.ones((2, 9)), np.eye(9)[::-1]):  # as many sensors as cells, and others
+        with pytest.raises(UserError, match=r"World of 3 x 3 cells.* and 9 sensors"):
+            begun(world=small_world().but(coverage=footprints, cost=0.1))
+    for other in (WORLD, small_world().but(t_max=0)):
+        with pytest.raises(UserError, match="expected a World of 3 x 3 cells"):
+            begun(world=other)
+    with pytest.raises(UserError, match="tracker: world: 1 modes, expected 8"):
+        some(WORLDS["mode"]).tracker(0, mode=1, world=small_world().but(t_max=2))
     tracker = begun(world=small_world())
     for belief in ([1.0], ["x"] * 9, [[1 / 9]] * 9, [None] * 9, [float("nan")] * 9, [1e308] * 9, 3):
         state = tracker.state() | {"belief": belief}

@@ -49,8 +49,8 @@ class Tracker(Following):
 
     Raises:
         UserError: the cell or position is outside the grid; the mode is missing, or given where detections do not
-            reveal it; the file holds no policy; the policy exceeds its budget; or the world is of another grid or other
-            sensors.
+            reveal it; the file holds no policy; the policy exceeds its budget; or the world is of another grid, t_max,
+            or number of modes, or of other sensors.
 
     Example:
         >>> from trackmdp import Policy, make_world
@@ -248,13 +248,23 @@ def _plan(policy: Plan | str | Path) -> Plan:
 
 
 def _check_world(world: Any, task: Task) -> None:
-    """Check that a world, where there is one, has a motion and is of the grid and the sensors of a task.
+    """Check that a world, where there is one, has a motion, and the grid, the clock, sensors and modes of a task.
 
     Raises:
-        UserError: it has none, or is not.
+        UserError: it has none, or has others.
     """
-    expected = task.size, task.total_sensors
-    found = tuple(getattr(world, name, None) for name in ("size", "total_sensors"))
-    if world is not None and (not hasattr(world, "kernel") or found != expected):
-        grid = f"{task.rows} x {task.columns} cells"
-        raise UserError(f"tracker: world: expected a World of {grid} and {expected[1]} sensors")
+    if world is None:
+        return
+    motion = isinstance(world, Task) and hasattr(world, "kernel")
+    if not motion or _sensing(world) != _sensing(task):
+        grid = f"{task.rows} x {task.columns} cells, t_max {task.t_max}"
+        sensors = f"{task.total_sensors} sensors, with the policy's footprints"
+        raise UserError(f"tracker: world: expected a World of {grid} and {sensors}")
+    if task.revealed not in (1, world.modes):
+        raise UserError(f"tracker: world: {world.modes} modes, expected {task.revealed}")
+
+
+def _sensing(task: Task) -> tuple[object, ...]:
+    """The facts on which reports to a tracker depend, but for probabilities."""
+    footprints = None if task.coverage is None else task.coverage.mark
+    return task.size, task.t_max, task.total_sensors, footprints
