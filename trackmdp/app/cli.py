@@ -94,7 +94,7 @@ def _dispatch(words: list[str]) -> int:
             )
         return _run(command, words[1:])
     except SystemExit as error:
-        if not (status := _signalled(error)):  # with which argparse ends after `--version`
+        if (status := _signalled(error)) <= 128:  # argparse ends so after `--version`
             raise
         return _report(command, Preempted(status - 128))
     except (Exception, KeyboardInterrupt, Preempted) as error:
@@ -142,7 +142,7 @@ def _signalled(error: BaseException | None) -> int:
         if isinstance(error, KeyboardInterrupt):
             return INTERRUPTED
         if isinstance(error, SystemExit):  # of `trackmdp.signals.leave`
-            return int(error.code or 0)
+            return error.code if isinstance(error.code, int) else 0
         passed.add(id(error))
         error = error.__cause__ or error.__context__
     return 0
