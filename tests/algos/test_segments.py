@@ -231,6 +231,15 @@ def test_unknown_cells_follow_the_heading() -> None:
     assert sum(list(path) in paths for path in found) > 0.98 * len(found)
 
 
+def test_a_single_cell_may_be_unknown() -> None:
+    """Of 0 ? 2 it is 1, where no sensor is."""
+    cost = np.where(np.arange(9) == 1, np.nan, 0.2)
+    task = replace(recorded(by_hand([0, 1, 2])), cost=cost, markov=False)
+    made = SensedPaths(task)
+    made.extend(collect(task, Policy.all_on(task), 1, 3))
+    assert pieces(made.tracks()) == [(0, 1, 2)]
+
+
 @pytest.mark.parametrize("cut", [1, 7, 40])
 def test_misses_of_the_safe_action_are_steps(cut: int) -> None:
     """The one path there is comes whole out of its pieces, however often the safe action missed on it."""
