@@ -17,6 +17,7 @@ from tests.algos.hindsight import FORMS, total
 from tests.helpers import small_world
 from trackmdp.algos.actor_loss import Decision, decision_loss
 from trackmdp.algos.hindsight_loss import HindsightLoss
+from trackmdp.algos.path_replay import Replay
 from trackmdp.sensing.coverage import discs
 from trackmdp.sensing.task import Task
 from trackmdp.world.model import World
@@ -186,6 +187,18 @@ def test_summed_up_losses_are_those_of_every_path_apart(
         for n in range(t_max + 1):
             ratio = ours[:, n].norm() / theirs[:, n].norm()
             torch.testing.assert_close(ours[:, n], theirs[:, n] * ratio, rtol=1e-3, atol=1e-6)
+
+
+def test_paths_that_all_end_before_a_detection_lose_nothing() -> None:
+    """As of short recordings, in a small batch."""
+    task = replace(small_world().task, markov=False)
+    rng = torch.Generator().manual_seed(1)
+    loss = HindsightLoss(task, Decision(), reach=1, hidden=4, discount=0.8, generator=rng)
+    cells = torch.full((Replay.steps(task.keys) + 1, 1), 9)
+    cells[0] = 0
+    rng.manual_seed(1)  # whose first draw, .76, keeps no path from its first cell on
+    losses = total(loss, cells, torch.zeros(9, task.num_choices, 9, dtype=torch.bool), 1.0)
+    assert {each.item() for each in losses.values()} == {0.0}
 
 
 def gradient(loss: Tensor, net: torch.nn.Module) -> Tensor:

@@ -326,4 +326,5 @@ def _squared_error(values: Tensor, start: Tensor, targets: Tensor) -> Tensor:
     """Of the values `[M, n]` of the keys that the paths start in, to the mean returns of these paths."""
     # The squared error per cell times its number of paths is, up to a constant, the sum over paths of (V - return)^2.
     visits = torch.bincount(start, minlength=len(values))
-    return (visits.unsqueeze(-1) * (values - targets).square()).sum() / len(start)
+    # No path is left where all end before the policy locates a target.
+    return (visits.unsqueeze(-1) * (values - targets).square()).sum() / max(len(start), 1)
