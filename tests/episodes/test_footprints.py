@@ -119,9 +119,11 @@ def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     again = ["baseline=playback", f"baseline.file={file}", "baseline.episode=0", "episodes=3"]
     assert main(["evaluate", *WORDS, *again, f"hydra.run.dir={tmp_path / 'again'}"]) == 0
     capsys.readouterr()
-    # Actions of four sensors say nothing to sixteen.
-    assert main(["evaluate", *WORDS[1:], *again, f"hydra.run.dir={tmp_path / 'other'}"]) != 0
-    assert "4" in capsys.readouterr().err
+    # Actions of four sensors say nothing to sixteen, nor to four that see more.
+    for others in ([], [WORDS[0], "sensor.radius=3"]):
+        there = f"hydra.run.dir={tmp_path / 'other'}"
+        assert main(["evaluate", *WORDS[1:], *others, *again, there]) == 2
+        assert "with sensors of other footprints" in capsys.readouterr().err
     assert main(["solve", *WORDS, f"hydra.run.dir={tmp_path / 'solved'}"]) == 0
     sets = ["baseline=sets", f"baseline.file={tmp_path / 'solved' / 'sets.json'}", "episodes=0"]
     assert main(["evaluate", *WORDS, *sets, f"hydra.run.dir={tmp_path / 'valued'}"]) == 0

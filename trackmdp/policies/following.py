@@ -110,8 +110,8 @@ class Following(ABC):
 
     def _facts(self) -> dict[str, Any]:
         """The facts of the task that keys and sensor ids depend on."""
-        covers, keys = self._task.coverage, asdict(self._keys) | {"size": list(self._task.size)}
-        own = {} if covers is None else {"footprints": covers.mark}
+        keys, mark = asdict(self._keys) | {"size": list(self._task.size)}, self._task.footprints
+        own = {} if mark is None else {"footprints": mark}
         return keys | {"sensors": self._task.total_sensors} | own
 
     def _check_state(self, state: Any) -> None:

@@ -266,5 +266,4 @@ def _check_world(world: Any, task: Task) -> None:
 
 def _sensing(task: Task) -> tuple[object, ...]:
     """The facts on which reports to a tracker depend, but for probabilities."""
-    footprints = None if task.coverage is None else task.coverage.mark
-    return task.size, task.t_max, task.total_sensors, footprints
+    return task.size, task.t_max, task.total_sensors, task.footprints

@@ -225,6 +225,11 @@ class Task(Carded):
         """`[..., M]`, the cells that the sensors of `action` `[..., S]` see: the action itself, but for footprints."""
         return action if self.coverage is None else self.coverage.cells(action)
 
+    @property
+    def footprints(self) -> str | None:
+        """A digest of the cells of each sensor; None where each covers the cell of its number."""
+        return None if self.coverage is None else self.coverage.mark
+
     @cached_property
     def available(self) -> BoolArray:
         """`[S]`, whether there is a sensor."""

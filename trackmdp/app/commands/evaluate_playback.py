@@ -27,9 +27,12 @@ def evaluate_playback(
     """
     with EpisodeReader(chosen.file) as reader:
         own = reader.world()
+        recorded = f"baseline.file={chosen.file}: recorded"
         if own.single.size != world.size:
-            recorded = f"baseline.file={chosen.file}: recorded on {grid_words(own.single.size)}"
-            raise UserError(f"{recorded}, expected grid.size of {grid_words(world.size)}")
+            on, expected = grid_words(own.single.size), grid_words(world.size)
+            raise UserError(f"{recorded} on {on}, expected grid.size of {expected}")
+        if own.single.footprints != world.footprints:
+            raise UserError(f"{recorded} with sensors of other footprints than the world's")
         if own.targets:
             raise UserError(f"baseline.file={chosen.file}: of several targets, expected one")
         logged = reader.read(chosen.episode)
