@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDictBase
-from torch import Tensor
+from torchrl.collectors import Collector
 from torchrl.envs.utils import check_env_specs
 
 import trackmdp as tm
 from tests.episodes.groups import check_steps
+from tests.tracks import by_hand, recorded
 from trackmdp.environment.env import TrackEnv
 from trackmdp.errors import UserError
 from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.several.merging import make_rule
 from trackmdp.solvers.solve import solve
 from trackmdp.world.group import Group
 from trackmdp.world.model import World
@@ -64,22 +67,17 @@ def test_a_step_is_rewarded_by_hand() -> None:
         torch.testing.assert_close(state["last_cell"], where)
 
 
-def test_union_earns_in_the_environment_what_the_joint_chain_says() -> None:
+@pytest.mark.parametrize("merge", ["gains", "union"])
+def test_a_rule_earns_in_the_environment_what_the_joint_chain_says(merge: str) -> None:
     group = Group([tm.make_world("random_walk", size=3, exit_probability=0.2, t_max=0)] * 2)
-    found = solve(group)
-    exact = evaluate(group, found, merge="union")
+    rule = make_rule(group, solve(group).tables, merge)
+    exact = evaluate(group, rule)
     assert exact.exact
-    table = torch.as_tensor(found.tables[0].dense()[:, 0])
-
-    def act(state: TensorDictBase) -> TensorDictBase:
-        wanted: Tensor = (state["steps_since_detection"] == 0) & state["present"]
-        return state.set("action", (table[state["last_cell"]] & wanted[..., None]).any(-2))
-
-    env = TrackEnv(group, 500, seed=1)
-    state, rewards, ends = env.reset(), torch.zeros(500, 1), 0
-    for _ in range(400):
-        shown, state = env.step_and_maybe_reset(act(state))
-        rewards += shown["next", "reward"]
+    rewards, ends = torch.zeros(500, 1), 0
+    for shown in Collector(
+        TrackEnv(group, 500, seed=1), rule, frames_per_batch=50_000, total_frames=200_000
+    ):
+        rewards += shown["next", "reward"].sum(1)
         ends += int(shown["next", "done"].sum())
     # In the long run episodes follow each other, so that rewards per step are AIHTR / length.
     each = rewards.numpy() / 400
@@ -88,6 +86,24 @@ def test_union_earns_in_the_environment_what_the_joint_chain_says() -> None:
     expected = exact.aihtr.mean / group.expected_steps
     assert each.mean() == pytest.approx(expected, abs=4 * error)
     assert error < 0.02 * abs(expected)
+
+
+# The second track enters when the first has made two steps, or has left.
+LATER = replace(by_hand([0, 1, 2, 1, 0, 3], [3, 4, 7, 8, 5, 2]), begins=np.array([0, 2]))
+ACTED = {
+    "three": two_kinds(t_max=2, cost=0.4, detection=0.7),
+    "footprints": two_kinds().but(coverage=np.tri(9, 9, 1), cost=0.3, safe_cost=2.0),
+    "no sensor": two_kinds(cost=np.where(np.arange(9) == 3, np.nan, 0.3), safe_cost=2.0),
+    "recorded": Group.of_tracks(recorded(LATER, t_max=2), 2),
+}
+
+
+@pytest.mark.parametrize("merge", ["gains", "union"])
+@pytest.mark.parametrize("name", ACTED)
+def test_a_rule_acts_on_what_is_shown_as_the_simulation_does(name: str, merge: str) -> None:
+    group = ACTED[name]
+    rule = make_rule(group, [solve(each).table for each in group.kinds], merge)
+    check_steps(group, tm.simulate(group, rule, 30), rule)
 
 
 @pytest.mark.parametrize("max_steps", [None, 6])
@@ -168,3 +184,24 @@ def test_what_several_targets_do_not_have_is_refused() -> None:
         env.render()
     with pytest.raises(UserError, match="5 sensors on, expected at most the budget, 1"):
         env.step(env.reset().set("action", torch.arange(18).view(2, 9) % 2 == 0))
+
+
+@pytest.mark.parametrize(
+    ("acted", "shown", "message"),
+    [
+        (two_kinds(safe_detection=0.9), None, "reads the steps in which the safe action missed"),
+        (
+            tm.make_world("heading", size=3, memory="displacement", targets=2),
+            None,
+            "reads the keys",
+        ),
+        (two_kinds(), Group(two_kinds().worlds[:2]), "expected last_cell, .* of 3 targets"),
+        (two_kinds(), two_kinds().single, "expected last_cell, .* of 3 targets"),
+    ],
+)
+def test_a_rule_refuses_states_that_do_not_show_all_that_it_reads(
+    acted: Group, shown: Group | World | None, message: str
+) -> None:
+    rule = solve(acted).policy
+    with pytest.raises(UserError, match=f"^policy: {message}"):
+        TrackEnv(shown or acted, 2).rollout(3, rule)

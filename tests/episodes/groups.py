@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from tensordict import TensorDict
 
 from tests.episodes.logs import CONFIG
 from trackmdp.environment.group_dynamics import GroupDynamics
@@ -20,9 +21,9 @@ from trackmdp.solvers.several.merging import Rule
 from trackmdp.world.group import Group
 
 
-def check_steps(group: Group, episodes: Iterable[Episode]) -> None:
-    """The environment makes the same steps of an episode's draws and actions, to the bit."""
-    paths, count = GroupPaths(group), len(group)
+def check_steps(group: Group, episodes: Iterable[Episode], rule: Rule | None = None) -> None:
+    """The environment makes the same steps of an episode's draws and actions, to the bit; and the rule the actions."""
+    paths, count = GroupPaths(group, held_out=True), len(group)
     dynamics = GroupDynamics(group.task, paths, count)
     for episode in episodes:
         moves, reports = (
@@ -33,6 +34,8 @@ def check_steps(group: Group, episodes: Iterable[Episode]) -> None:
         drawn = paths.sampler.draw(256 * count, moves).view(-1, count)
         seen = torch.rand(256, count, dtype=torch.float64, generator=reports)
         for step, move, report in zip(episode.to_tensordict(group.task), drawn, seen, strict=False):
+            if rule is not None:
+                assert torch.equal(rule(TensorDict(state, 1))["action"][0], step["action"])
             state = dynamics.advance(state, step["action"][None], move, report)
             for key, expected in step["next"].items():
                 assert torch.equal(state[key][0], expected), key

@@ -123,8 +123,9 @@ def test_plans_go_with_their_motions_to_other_targets() -> None:
                 assert mine.aihtr == evaluate(targets, rule).aihtr
     with pytest.raises(UserError, match="policy: number of plans 1, expected 2"):
         evaluate(both, alone)
-    with pytest.raises(UserError, match="policy: for 2 targets, expected one for a single target"):
-        tm.simulate(one, found.policy, 2)  # type: ignore[call-overload]
+    for call in (tm.evaluate, lambda *given: tm.simulate(*given, 2)):
+        with pytest.raises(UserError, match="policy: for 2 targets, expected one for a single"):
+            call(one, found.policy)
 
 
 def test_commands_solve_and_evaluate_with_several_targets(tmp_path: Path) -> None:

@@ -24,9 +24,8 @@ from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import PolicyLike
 from trackmdp.seeding import derive, preserved_global_rng
 from trackmdp.sensing.outcomes import Costs, Outcomes
-from trackmdp.solvers.evaluate import group_rule
+from trackmdp.solvers.evaluate import group_rule, of_single
 from trackmdp.solvers.several.merging import Rule
-from trackmdp.solvers.solve import named_policy
 from trackmdp.solvers.value import check_revealed
 from trackmdp.world.group import Group, Subject, check_problem
 from trackmdp.world.problem import Problem
@@ -85,12 +84,8 @@ def simulate(
         policy = group_rule(problem, policy, **of_group)
     elif of_group:
         raise UserError(f"{min(of_group)}: an option of several targets, expected none with one")
-    elif isinstance(policy, Rule):
-        raise UserError(
-            f"policy: for {len(policy.group)} targets, expected one for a single target"
-        )
-    elif isinstance(policy, str):
-        policy = named_policy(problem, policy)
+    else:
+        policy = of_single(problem, policy)
 
     def first(count: int) -> Any:
         return resimulate(problem, policy, episode_seeds(seed, count, *names))

@@ -107,5 +107,17 @@ def group_rule(group: Group, policy: Any, merge: str | None = None) -> Rule:
 
 def policy_table(problem: Problem, policy: PolicyLike | Array | BoolArray) -> PolicyTable:
     """The table of a policy in any form; a name is that of a baseline."""
-    made = named_policy(problem, policy) if isinstance(policy, str) else policy
-    return value.as_table(problem, made)
+    return value.as_table(problem, of_single(problem, policy))
+
+
+def of_single(problem: Problem, policy: Any) -> Any:
+    """A policy of a single target, made where it is the name of a baseline.
+
+    Raises:
+        UserError: it is one for several targets.
+    """
+    if isinstance(policy, Rule):
+        raise UserError(
+            f"policy: for {len(policy.group)} targets, expected one for a single target"
+        )
+    return named_policy(problem, policy) if isinstance(policy, str) else policy

@@ -20,7 +20,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from scipy import sparse
@@ -34,6 +34,9 @@ from trackmdp.sensing.decisions import report_chance, sensing
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found
 from trackmdp.world.group import Group
+
+if TYPE_CHECKING:  # figures of a rule need no torch
+    from tensordict import TensorDictBase
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,21 @@ class Beliefs:
         first = group.kind[rows % len(group)] * group.states + cells * modes
         states = (first[:, None] + np.arange(modes)).ravel()
         return cls(np.repeat(rows, modes), states, np.full(len(states), 1.0 / modes))
+
+    @classmethod
+    def recalled(cls, group: Group, clocks: Clocks) -> Beliefs:
+        """From the sets of the steps since each detection, in which no safe action has missed."""
+        assert clocks.history is not None
+        misses, beliefs = np.where(clocks.present, clocks.misses, -1).ravel(), cls.none()
+        for back in range(group.task.t_max, -1, -1):
+            rows = np.flatnonzero(misses == back)
+            beliefs = beliefs.joined(cls.found(group, rows, clocks.located.ravel()[rows]))
+            if back:  # the step that was `back` steps ago, the latest one being 1
+                moved, on = beliefs.moved(group), np.flatnonzero(clocks.history[:, back - 1])
+                episode, cell = moved.row // len(group), group.cell_of(moved.state)
+                chance = report_chance(group.task, on, episode, cell)
+                beliefs = moved.given(misses >= back, chance, misses.size)
+        return beliefs
 
     def seen(self, group: Group, rows: IndexArray, cells: IndexArray) -> Beliefs:
         """The targets `rows` of a step's `moved` beliefs, located in `cells`.
@@ -238,6 +256,43 @@ class Rule(ABC):
             on = table.written[row].tocoo()
             found.append(episode[on.row] * self.sensors + on.col)
         return distinct(np.concatenate(found))
+
+    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write `action` `[*B, S]` bool, in the states that `TrackEnv` shows of the targets: a policy of TorchRL.
+
+        No sensor is on where the safe action is due.
+
+        Raises:
+            UserError: it reads more than these states hold, or they are of other targets.
+        """
+        unseen = "the keys of its plans" if self.keys.order else ""
+        if self.reads_beliefs and not self.task.safe:
+            unseen = "the steps in which the safe action missed"
+        if unseen:
+            raise UserError(f"policy: reads {unseen}, which TrackEnv does not show; simulate it")
+        targets = len(self.group)
+        shapes: dict[str, tuple[int, ...]] = {
+            "last_cell": (targets,),
+            "steps_since_detection": (targets,),
+            "present": (targets,),
+            "action_history": (self.task.num_choices, self.sensors),
+        }
+        parts = [tensordict.get(name, None) for name in shapes]
+        each = list(zip(parts, shapes.values(), strict=True))
+        if any(part is None or part.shape[-len(shape) :] != shape for part, shape in each):
+            raise UserError(
+                f"policy: expected {', '.join(shapes)}, as TrackEnv shows them of {targets} targets"
+            )
+        seen = Clocks(*(part.cpu().numpy().reshape(-1, *shape) for part, shape in each))
+        moved = Beliefs.none()
+        if self.reads_beliefs:
+            moved = Beliefs.recalled(self.group, seen).moved(self.group)
+        action = np.zeros((len(seen.present), self.sensors), dtype=bool)
+        action.reshape(-1)[self.sets(seen, moved)] = True
+        action[seen.late(self.task.t_max)] = False
+        past = parts[-1]
+        found = past.new_tensor(action).view(*past.shape[:-2], self.sensors)
+        return tensordict.set("action", found)
 
     def packed(self) -> list[dict[str, Any]]:
         """The arrays from which it is made again, of each kind."""
