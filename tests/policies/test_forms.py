@@ -165,6 +165,48 @@ def test_a_model_of_stable_baselines_is_given_the_mask_and_refused_where_it_read
             call(limited, Model(limited))
 
 
+class Together:
+    """As a model of Stable-Baselines3 that was trained in `TrackGym`: the sensors around all targets that are there."""
+
+    def __init__(self, group: tm.Group) -> None:
+        self.observation_space = SimpleNamespace(spaces=tm.TrackEnv(group).observation_spec)
+
+    def predict(self, seen: dict[str, Any], deterministic: bool) -> tuple[Any, None]:
+        assert deterministic
+        near = np.abs(np.arange(9) - seen["last_cell"][..., None]) <= 1
+        return (near & seen["present"][..., None]).any(1).astype(np.int8), None
+
+
+@pytest.mark.parametrize("how", ["Stable-Baselines3", "TorchRL"])
+def test_a_model_that_reads_what_is_shown_of_all_targets_is_valued(how: str) -> None:
+    group, cells = tm.Group([WORLD] * 2), torch.arange(9)
+    same = tm.Policy.from_function(WORLD, lambda x, n, h: (cells - x[:, None]).abs() <= 1)
+
+    def act(last: torch.Tensor, here: torch.Tensor) -> torch.Tensor:
+        return (((cells - last[..., None]).abs() <= 1) & here[..., None]).any(1).float()
+
+    actor = TensorDictModule(act, in_keys=["last_cell", "present"], out_keys=["action"])
+    model = actor if how == "TorchRL" else Together(group)
+    union = tm.evaluate(group, same, merge="union", width=0.05)
+    assert np.array_equal(tm.evaluate(group, model, width=0.05).totals, union.totals)
+    assert len(tm.simulate(group, model, 3)) == 3
+
+
+def test_a_model_for_all_targets_is_refused_where_it_draws_or_reads_more() -> None:
+    limited = tm.Group([tm.make_world("random_walk", size=3, max_steps=5)] * 2)
+    with pytest.raises(UserError, match="policy: the model reads step_count, expected last_cell"):
+        tm.evaluate(limited, Together(limited))
+    group = tm.Group([WORLD] * 2)
+    for act, name, message in (
+        (lambda here: torch.rand(len(here), 9) < 0.5, "action", "draws at random"),
+        (lambda here: here, "action", r"its action: expected .* \[9, 9\], got bool \[9, 2\]"),
+        (lambda here: here, "set", "the module writes no action"),
+    ):
+        module = TensorDictModule(act, in_keys=["present"], out_keys=[name])
+        with pytest.raises(UserError, match=f"policy: {message}"):
+            tm.evaluate(group, module)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

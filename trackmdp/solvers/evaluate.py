@@ -55,7 +55,7 @@ def evaluate(
             recorded tracks along all groups of held-out ones.
         policy: a `Policy` or its table, or the same dense, `[M, t_max + 1, M]`; a TensorDict module or a function
             that does not draw (`Policy.from_function`); a `Run`, a `Solution`, a model of Stable-Baselines3; or the
-            name of a baseline.
+            name of a baseline. A module or model that reads `present` is one for all targets, and taken at its mode.
         false_alarm: p_f, the probability that a sensor that is on reports a target that is not there; the policy
             takes each report for the truth (`trackmdp.solvers.false_alarms`).
         **of_group: of a `Group` alone: `merge`, "gains" or "union" (the default on recorded tracks); `width`, half of
@@ -94,6 +94,11 @@ def group_rule(group: Group, policy: Any, merge: str | None = None) -> Rule:
     """
     merge = merge or getattr(policy, "merge", None)
     held = policy if isinstance(policy, Rule) else getattr(policy, "policy", None)
+    spaces = getattr(getattr(policy, "observation_space", None), "spaces", ())
+    if "present" in getattr(policy, "in_keys", spaces):
+        from trackmdp.solvers.several.joint_rule import JointRule  # which loads torch
+
+        held = JointRule.given(group, policy)
     if not isinstance(held, Rule):
         singles = [group.single] if group.recorded else group.kinds
         return make_rule(group, [policy_table(each, policy) for each in singles], merge)

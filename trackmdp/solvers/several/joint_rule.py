@@ -11,13 +11,17 @@ import numpy as np
 import torch
 from scipy import sparse
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from trackmdp.arrays.files import npz_bytes
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.durable import write_bytes
 from trackmdp.errors import UserError, output_of
+from trackmdp.policies.forms import DrawsError, state_keys
+from trackmdp.seeding import preserved_global_rng
+from trackmdp.sensing.actions import checked_action
 from trackmdp.solvers.several.group_tracker import GroupTracker
 from trackmdp.solvers.several.merging import Beliefs, Clocks, Rule
 from trackmdp.world.group import Group
@@ -40,6 +44,45 @@ class JointRule(Rule):
         # Rounding differs with the number of rows of a batch. In double precision that does not turn a set over, so
         # that an episode that is simulated again, beside others, is the same.
         self._device, self.actor = device, copy.deepcopy(actor).to(device).double()
+
+    @classmethod
+    def given(cls, group: Group, policy: Any) -> JointRule:
+        """A user's actor of TorchRL, or model of Stable-Baselines3, that reads what is shown of a group, at its mode.
+
+        It is not copied.
+
+        Raises:
+            DrawsError: it draws.
+            UserError: it reads other keys, or its action has another form.
+        """
+        known = [*state_keys(group.task, group.targets), "action_mask"]
+        module = isinstance(policy, TensorDictModuleBase)
+        names = list(policy.in_keys if module else policy.observation_space.spaces)
+        if others := sorted({*map(str, names)} - {*known}):
+            wanted = ", ".join(known)
+            raise UserError(
+                f"policy: the model reads {', '.join(others)}, expected {wanted} at most"
+            )
+        if module and "action" not in policy.out_keys:
+            raise UserError("policy: the module writes no action")
+        weights = policy.parameters() if module else ()
+        device = next((each.device for each in weights), torch.device("cpu"))
+
+        def action(*state: Tensor) -> Tensor:
+            seen = dict(zip(names, state, strict=True))
+            if module:
+                return policy(TensorDict(seen, len(state[0]), device=device))["action"]
+            arrays = {name: part.numpy() for name, part in seen.items()}
+            return torch.as_tensor(policy.predict(arrays, deterministic=True)[0])
+
+        # A function has no weights, of which others would be made in double precision.
+        rule = cls(group, TensorDictModule(action, names, ["action"]), device)
+        with preserved_global_rng():
+            before = torch.get_rng_state()
+            rule.first_sets()
+            if not torch.equal(before, torch.get_rng_state()):
+                raise DrawsError("policy: draws at random, expected one that does not")
+        return rule
 
     def within(self, group: Group) -> JointRule:
         """See `Rule`."""
@@ -76,10 +119,13 @@ class JointRule(Rule):
         }
         rows = {name: torch.as_tensor(part) for name, part in parts.items()}
         rows["action_history"] = torch.as_tensor(seen.history)
+        rows["action_mask"] = torch.as_tensor(self.task.available).expand(len(misses), -1)
         state = TensorDict(rows, len(misses)).to(self._device)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            action = self.actor(state)["action"].cpu().numpy()
-        return action & self.task.available
+            action = self.actor(state)["action"]
+        shape = len(misses), self.sensors
+        found = checked_action(action, shape, "policy: its action", self.task.budget)
+        return found.cpu().numpy() & self.task.available
 
     def tracker(
         self,
