@@ -14,6 +14,7 @@ import trackmdp as tm
 from tests.episodes.groups import check_steps
 from tests.tracks import by_hand, recorded
 from trackmdp.environment.env import TrackEnv
+from trackmdp.environment.render import LEGEND_OF_SEVERAL
 from trackmdp.errors import UserError
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.several.merging import make_rule
@@ -176,12 +177,37 @@ def test_a_snapshot_continues_with_the_same_draws() -> None:
         TrackEnv(two_kinds(), 5).restore(kept)
 
 
+def test_its_picture_shows_all_targets() -> None:
+    """Targets that stay in cells 1 and 2 of 2 x 2: at first, one missed, the safe action, one that has left."""
+    env = TrackEnv(Group([World(np.eye(4), 2, cost=0.1, t_max=0, max_steps=9)] * 2), 2)
+    env.reset()
+    there = env.snapshot()
+    there["rows"] |= dict.fromkeys(("place", "last_cell"), torch.tensor([[0, 0], [1, 2]]))
+    state, pictures = env.restore(there), [env.render("text", 1)]
+    for cells in ([0, 1], [3]):
+        action = torch.isin(torch.arange(4), torch.tensor(cells)).expand(2, 4)
+        state = env.step(state.set("action", action))["next"].select(*env.observation_spec)
+        pictures.append(env.render("text", 1))
+    there = env.snapshot()
+    there["rows"]["place"] = torch.tensor([[0, 0], [4, 2]])
+    env.restore(there)
+    pictures.append(env.render("text", 1))
+    assert [each.splitlines()[:2] for each in pictures] == [
+        ["· ⓿", "❶ ·"],
+        ["▪ ⓿", "① ·"],
+        ["▪ ⓿", "❶ ▪"],
+        ["· ·", "❶ ·"],
+    ]
+    assert pictures[0].endswith(LEGEND_OF_SEVERAL)
+    pixels = env.render(row=1)
+    assert not isinstance(pixels, str)
+    assert (pixels[17:31, 1:15] == (0, 90, 181)).all()
+
+
 def test_what_several_targets_do_not_have_is_refused() -> None:
     group = two_kinds(budget=1)
     env = TrackEnv(group, 2)
     assert int(env.rollout(9, break_when_any_done=False)["action"].sum(-1).max()) <= 1
-    with pytest.raises(UserError, match="render: 3 targets, expected a world of one"):
-        env.render()
     with pytest.raises(UserError, match="5 sensors on, expected at most the budget, 1"):
         env.step(env.reset().set("action", torch.arange(18).view(2, 9) % 2 == 0))
 

@@ -146,25 +146,26 @@ class TrackEnv(EnvBase):
         return self._tracking
 
     def render(self, mode: str = "rgb_array", row: int = 0) -> npt.NDArray[np.uint8] | str:
-        """The grid after the last step: the target, and the sensors that were on, none if an episode has just begun.
+        """The grid after the last step: the targets, and the sensors that were on, none if an episode has just begun.
+
+        Of several targets in one cell the first is shown.
 
         Args:
             mode: "rgb_array" for `[16 rows, 16 columns, 3]` uint8, or "text".
-            row: number of the target, the batch flattened.
+            row: number of the target or group, the batch flattened.
 
         Raises:
-            UserError: another mode, a row that is not there, several targets, or there was no reset before.
+            UserError: another mode, a row that is not there, or there was no reset before.
         """
         if mode not in ("rgb_array", "text") or not 0 <= row < self.num_envs:
             raise UserError(
                 f"render({mode!r}, {row}): expected rgb_array or text, a row of 0 ... {self.num_envs - 1}"
             )
         now = self._now
-        if self._targets:
-            raise UserError(f"render: {self._targets[0]} targets, expected a world of one")
-        on = now.covered(row).cpu().numpy()
-        found = not now.state["steps_since_detection"][row]
-        return picture(mode, self._grid, int(now.target()[row]), on, found=found)
+        found = now.state["steps_since_detection"][row] == 0
+        shown = now.target()[row], now.covered(row), found
+        cell, on, located = (each.cpu().numpy() for each in shown)
+        return picture(mode, self._grid, cell, on, found=located)
 
     def _make_specs(self, task: Task) -> None:
         b = self.batch_size

@@ -23,6 +23,7 @@ class GroupDynamics:
         targets: K.
 
     Attributes:
+        detection: the probability of reports.
         masked: whether some cells have no sensor, so that `action_mask` is observed.
         waits: whether targets may enter later.
     """
@@ -33,7 +34,7 @@ class GroupDynamics:
         self._cells, self._max_steps, self._t_max = task.num_cells, task.max_steps, task.t_max
         self._costs, self._history = Costs(task, device), (task.num_choices, task.total_sensors)
         self._reward, self._safe = task.reward, task.safe_cost
-        self._report = Detection(task, device, everywhere=True)
+        self.detection = Detection(task, device, everywhere=True)
         self._safe_report = torch.as_tensor(task.safe_detection, device=device)
         self._available = torch.as_tensor(task.available, device=device)
         self.masked = not task.available.all()
@@ -74,7 +75,7 @@ class GroupDynamics:
         present, n = inside & state["present"], state["steps_since_detection"]
         forced = (n > self._t_max).any(-1, keepdim=True)
         on = action & self._available
-        report = self._report(on, cell, cell)
+        report = self.detection(on, cell, cell)
         if reports is None:
             report = report | forced
         else:

@@ -88,7 +88,7 @@ class _Tracked:
         return {"target": target if target.ndim else int(target)}
 
     def render(self) -> Any:
-        """The grid of the (first) target after the last step, in the render mode; "human" prints it at each step."""
+        """The grid of the first target or group after the last step, in its mode; "human" prints it at each step."""
         if self.render_mode is None:
             return None
         picture = self._env.render(_MODES[self.render_mode])
@@ -145,7 +145,7 @@ class TrackVector(_Tracked, VectorEnv[Observation, npt.NDArray[np.int8], npt.NDA
 
     Args:
         num_envs: B.
-        world: see `TrackGym`, as for `render_mode` and `options`; the picture shows the first target.
+        world: see `TrackGym`, as for `render_mode` and `options`; the picture shows the first target or group.
         render_mode: see `TrackGym`.
         options: see `TrackGym`.
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from trackmdp.arrays.types import BoolArray
+from trackmdp.arrays.types import BoolArray, IndexArray
 
 FOUND, MISSED, ON, OFF = "●", "○", "▪", "·"
 PICTURE_LEGEND = (
@@ -20,7 +20,12 @@ FOUND_OF_SEVERAL = f"{NUMBERED[0][:2]} targets 0 and 1, located", f"{NUMBERED[1]
 LEGEND_OF_SEVERAL = "   ".join([*FOUND_OF_SEVERAL, f"{ON} sensor on", f"{OFF} sensor off"])
 
 # Red, green, blue; distinct in grey as well, and without red.
-_COLOURS = {FOUND: (0, 90, 181), MISSED: (220, 50, 32), ON: (255, 194, 10), OFF: (238, 238, 238)}
+_COLOURS = {
+    FOUND + NUMBERED[0]: (0, 90, 181),
+    MISSED + NUMBERED[1]: (220, 50, 32),
+    ON: (255, 194, 10),
+    OFF: (238, 238, 238),
+}
 _SIDE, _GAP = 16, 1  # pixels of a cell, and of the white line around it
 
 
@@ -49,27 +54,29 @@ def around(place: int, length: int, wide: int) -> range:
 
 
 def picture(
-    mode: str, size: Sequence[int], cell: int, on: BoolArray, *, found: bool
+    mode: str, size: Sequence[int], cell: IndexArray, on: BoolArray, *, found: BoolArray
 ) -> npt.NDArray[np.uint8] | str:
     """The grid as pixels or as text.
 
     Args:
         mode: "rgb_array" for red, green and blue `[16 rows, 16 columns, 3]`, else a line of symbols for each row, and
-            `PICTURE_LEGEND`.
+            their legend.
         size: rows and columns.
-        cell: the target's, M where it has exited.
+        cell: the target's, M where it has exited; of several targets `[K]`, as for `found`.
         on: `[M]` sensors that are on.
         found: whether the target is detected.
     """
     marks = symbols(size, cell, on, found=found)
     if mode != "rgb_array":
-        return "\n".join([*(" ".join(row) for row in marks), PICTURE_LEGEND])
+        legend = PICTURE_LEGEND if cell.size == 1 else LEGEND_OF_SEVERAL
+        return "\n".join([*(" ".join(row) for row in marks), legend])
     pixels = np.full((*marks.shape, _SIDE, _SIDE, 3), 255, dtype=np.uint8)
-    for symbol, colour in _COLOURS.items():
+    for alike, colour in _COLOURS.items():
+        here = np.isin(marks, list(alike))
         # A boolean index picks whole tiles, [hits, side, side, 3], and their inner part gets the colour.
-        tiles = pixels[marks == symbol]
+        tiles = pixels[here]
         tiles[:, _GAP:-_GAP, _GAP:-_GAP] = colour
-        pixels[marks == symbol] = tiles
+        pixels[here] = tiles
     # [rows, columns, y, x, 3] to [rows, y, columns, x, 3]: neighbouring tiles' lines of pixels side by side.
     rows, columns = marks.shape
     return pixels.transpose(0, 2, 1, 3, 4).reshape(rows * _SIDE, columns * _SIDE, 3)

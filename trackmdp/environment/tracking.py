@@ -133,9 +133,10 @@ class Tracking:
         """`[M]` bool, the cells that the sensors of a row's last step cover; none where an episode has just begun."""
         if self._acted is None or any(done[row] for done in self._begun):
             return self._cells < 0
-        assert isinstance(self.dynamics, Dynamics)
         action, last, misses = (each[row] for each in self._acted)
-        if misses > self._t_max:
+        if (misses > self._t_max).any():
             return self._cells >= 0
-        action, last = action.expand(len(self._cells), -1), last.expand(len(self._cells))
+        # Of several targets any cell will do, as there is no window.
+        last = last.view(-1)[:1].expand(len(self._cells))
+        action = action.expand(len(self._cells), -1)
         return self.dynamics.detection(action, last, self._cells) > 0
