@@ -17,10 +17,11 @@ from trackmdp.policies.policy import Policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.several import group_bounds
+from trackmdp.solvers.several.beliefs import Beliefs, Clocks
 from trackmdp.solvers.several.group_bounds import equal_shares, upper_bound
 from trackmdp.solvers.several.group_chain import explored
 from trackmdp.solvers.several.group_value import evaluate_group
-from trackmdp.solvers.several.merging import Beliefs, Clocks, Rule, make_rule
+from trackmdp.solvers.several.merging import Rule, make_rule
 from trackmdp.solvers.solve import solve
 from trackmdp.world.group import Group
 from trackmdp.world.model import World

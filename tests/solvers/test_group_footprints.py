@@ -13,9 +13,10 @@ from tests.episodes import groups
 from tests.solvers.test_group import best_of_all, check_figures, tiny
 from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.errors import UserError
+from trackmdp.solvers.several.beliefs import Beliefs, Clocks
 from trackmdp.solvers.several.group_bounds import sensors_suffice, upper_bound
 from trackmdp.solvers.several.group_value import evaluate_group
-from trackmdp.solvers.several.merging import Beliefs, Clocks, Rule, make_rule
+from trackmdp.solvers.several.merging import Rule, make_rule
 from trackmdp.world.group import Group
 from trackmdp.world.model import World
 

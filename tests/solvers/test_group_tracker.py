@@ -10,7 +10,7 @@ import pytest
 import trackmdp as tm
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
-from trackmdp.solvers.several.merging import Beliefs, Clocks
+from trackmdp.solvers.several.beliefs import Beliefs, Clocks
 from trackmdp.solvers.solve import solve
 from trackmdp.world.group import Group
 from trackmdp.world.model import World

@@ -55,9 +55,7 @@ class PerSensorConfig(EveryTaskConfig):
     updates: int | None = count_option(
         "updates of the whole run; null: by the size of the problem", le=10**9
     )
-    updates_per_iteration: int = count_option(
-        "updates from one evaluation, log row or checkpoint to the next at most"
-    )
+    updates_per_iteration: int = count_option("most updates between evaluations or log rows")
     hidden: int | None = option(
         "units of each net's hidden layer, 0 = plain tables without one; null: by the size of the problem, from 4,097 "
         "cells on tables",

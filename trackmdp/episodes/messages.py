@@ -132,8 +132,8 @@ class Form:
     ) -> Episode:
         """The episode of a row, from messages among which are its own.
 
-        Most of what a step says is for viewers, and follows from the rest of it: with `whole` that is checked as well,
-        which takes as long as the rest.
+        Most figures of a step are for viewers, and follow from the others: with `whole` they are checked as well, which
+        takes as long as the rest.
 
         Raises:
             UserError, ValueError, KeyError, TypeError: they do not fit together.

@@ -49,7 +49,7 @@ def recover(file: Path) -> Recovered:
         try:
             return Recovered(writer.finish(), writer.episodes, tuple(damaged))
         finally:
-            writer.abandon()  # closes what a full disk leaves open
+            writer.abandon()  # a full disk leaves it open
 
 
 def taken_over(file: Path, target: Path, policies: int) -> EpisodeWriter | None:

@@ -57,7 +57,7 @@ def write_video(file: Path, task: Task, episode: Episode, speed: int) -> None:
 
 
 def _write_gif(part: Path, drawn: Iterator[None], canvas: Any, speed: int) -> None:
-    """Write each frame as soon as it is drawn: only what is different from the one before, with colours of its own.
+    """Write each frame as soon as it is drawn: only the part that differs from the one before, with its own colours.
 
     PIL's `save` and matplotlib's writer keep all frames until the last one is there.
     """

@@ -14,7 +14,8 @@ from trackmdp.arrays.types import Array, IndexArray
 from trackmdp.sensing.decisions import report_chance
 from trackmdp.solvers.motion_totals import summed_over
 from trackmdp.solvers.pomdp import Chain, reached
-from trackmdp.solvers.several.merging import Beliefs, Clocks, Rule
+from trackmdp.solvers.several.beliefs import Beliefs, Clocks
+from trackmdp.solvers.several.merging import Rule
 from trackmdp.world.group import Group
 
 MOST_STATES = 2_000

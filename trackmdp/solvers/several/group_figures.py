@@ -31,7 +31,7 @@ class GroupEvaluation(Carded):
         exact: whether they are exact.
         expected_length: steps until the last target has left, exact; on recorded tracks the mean.
         controls: exact means of the second and of the last column; None on recorded tracks, which have none.
-        units: the word for one of the units that totals are of, and what follows it; see `counted_words`.
+        units: the word for one of the units that totals are of, and the words after it; see `counted_words`.
     """
 
     totals: Array

@@ -12,7 +12,8 @@ from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.errors import UserError
 from trackmdp.memory.keys import KeySpace
 from trackmdp.policies.following import Following, probabilities
-from trackmdp.solvers.several.merging import Beliefs, Clocks, Rule, followed
+from trackmdp.solvers.several.beliefs import Beliefs, Clocks
+from trackmdp.solvers.several.merging import Rule, followed
 
 
 class GroupTracker(Following):

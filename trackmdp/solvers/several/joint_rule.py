@@ -22,8 +22,9 @@ from trackmdp.errors import UserError, output_of
 from trackmdp.policies.forms import DrawsError, state_keys
 from trackmdp.seeding import preserved_global_rng
 from trackmdp.sensing.actions import checked_action
+from trackmdp.solvers.several.beliefs import Beliefs, Clocks
 from trackmdp.solvers.several.group_tracker import GroupTracker
-from trackmdp.solvers.several.merging import Beliefs, Clocks, Rule
+from trackmdp.solvers.several.merging import Rule
 from trackmdp.world.group import Group
 
 
@@ -47,7 +48,7 @@ class JointRule(Rule):
 
     @classmethod
     def given(cls, group: Group, policy: Any) -> JointRule:
-        """A user's actor of TorchRL, or model of Stable-Baselines3, that reads what is shown of a group, at its mode.
+        """A user's actor of TorchRL, or model of Stable-Baselines3, that reads the states of a group, at its mode.
 
         It is not copied.
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.sensing.decisions import report_chance
-from trackmdp.solvers.several.merging import Beliefs, Clocks, Rule, followed
+from trackmdp.solvers.several.beliefs import Beliefs, Clocks
+from trackmdp.solvers.several.merging import Rule, followed
 
 
 class Moving(Protocol):
