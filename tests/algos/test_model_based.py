@@ -11,6 +11,7 @@ import pytest
 import torch
 from scipy import sparse
 
+import trackmdp as tm
 from tests.algos.estimates.test_path_counts import SWEEP
 from tests.helpers import algorithm, collect, headings, hop_world, small_world, train_config
 from tests.tracks import by_hand, recorded, write
@@ -22,6 +23,7 @@ from trackmdp.algos.estimates.shrinkage import without
 from trackmdp.algos.model_based import ModelBased
 from trackmdp.algos.observed import observed_paths
 from trackmdp.app.cli import main
+from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.recordings.tracks import Recorded
@@ -359,3 +361,15 @@ def test_options_without_a_meaning_are_refused(
 ) -> None:
     assert expected in refused(capsys, "train", *words)
     assert not list(here.iterdir())
+
+
+@pytest.mark.parametrize("frames", [2, 4])
+def test_a_target_may_not_be_located_yet(frames: int) -> None:
+    """With a budget no sensor is on at first: the safe action comes in the third step, in a batch of two the second."""
+    world = headings(2, memory="displacement", t_max=1).but(budget=1)
+    words: Any = {"total_frames": frames, "frames_per_batch": 2, "envs": 1}
+    if frames > 2:
+        assert tm.train(world, "model_based", **words).evaluation.error == 0
+        return
+    with pytest.raises(UserError, match=r"^algo\.total_frames: in none of them was a target"):
+        tm.train(world, "model_based", **words)

@@ -23,6 +23,10 @@ from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.sensing.task import Task
 
+NEVER_LOCATED = (
+    "algo.total_frames: in none of them was a target located and sensed again; expected more"
+)
+
 
 class Algorithm(Protocol):
     """One learning method. An iteration is one collected batch, if frames are left, and then some learning."""

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 from trackmdp.algos.actor_loss import ActorLoss, Decision
 from trackmdp.algos.common import (
+    NEVER_LOCATED,
     Averages,
     Checkpointed,
     choosable_places,
@@ -234,9 +235,7 @@ class Hindsight(Checkpointed):
             UserError: it was never seen to move.
         """
         if not len(self._buffer):
-            raise UserError(
-                "algo.total_frames: in none of them was a target located and sensed again; expected more"
-            )
+            raise UserError(NEVER_LOCATED)
         if self._seen is None:
             self._seen = int(_distance(*self._buffer.moves(), self.task).max())
         return self._seen

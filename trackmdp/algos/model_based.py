@@ -17,7 +17,15 @@ import torch
 from scipy import sparse
 from tensordict import TensorDictBase
 
-from trackmdp.algos.common import Checkpointed, arrays, known_alone, lifted, located, tensors
+from trackmdp.algos.common import (
+    NEVER_LOCATED,
+    Checkpointed,
+    arrays,
+    known_alone,
+    lifted,
+    located,
+    tensors,
+)
 from trackmdp.algos.estimates.alike import cell_classes
 from trackmdp.algos.estimates.hidden_modes import Fit, fit_modes
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
@@ -27,6 +35,7 @@ from trackmdp.algos.estimates.path_plans import TRIED, UNJUDGED, Maker, choose_p
 from trackmdp.algos.estimates.shrinkage import least_worth_planning, without
 from trackmdp.algos.observed import SensedPaths, observed_paths
 from trackmdp.config.counting import ModelBasedConfig
+from trackmdp.errors import UserError
 from trackmdp.policies.acting import RenewedTable
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.saved import packed, unpacked_policy
@@ -167,9 +176,17 @@ class ModelBased(Checkpointed):
         return plan
 
     def _plan_paths(self, last: bool) -> PolicyTable:
-        """The plan on the sensed paths: at the end the best one of several on validation paths."""
+        """The plan on the sensed paths: at the end the best one of several on validation paths.
+
+        Raises:
+            UserError: there are none at the end.
+        """
         assert self._paths is not None
         task, cfg, tracks = self.task, self.cfg, self._paths.tracks()
+        if not len(tracks):
+            if last:
+                raise UserError(NEVER_LOCATED)
+            return self.actor
         if last and cfg.prior is None:
             others: list[Maker] = [self._pooled] if self._compares else []
             if self._compares and _MODES * task.num_cells <= _MOST_STATES:
