@@ -8,6 +8,7 @@ import os
 import re
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -126,6 +127,16 @@ def test_seconds_may_be_texts() -> None:
     """Not years, which pandas takes 1000 and 1060 for."""
     table = pd.DataFrame({"id": "a", "time": ["1000", "1060", "1060.5"], "x": 0.0, "y": 0.0})
     assert frame_positions(table).time.tolist() == [1000, 1060, 1060.5]
+
+
+@pytest.mark.parametrize(
+    "times", [pd.period_range("2024-01", periods=2, freq="D"), [True, False], [1j, 2j]]
+)
+def test_times_that_are_neither_seconds_nor_dates_are_refused(times: Any) -> None:
+    """Not counted in days, or cut to real parts."""
+    table = pd.DataFrame({"id": "a", "time": times, "x": 0.0, "y": 0.0})
+    with pytest.raises(ValueError, match=r"time of entry 1.*seconds or a time"):
+        frame_positions(table)
 
 
 def test_a_column_of_missing_times_holds_none() -> None:

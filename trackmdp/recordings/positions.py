@@ -150,8 +150,8 @@ def _seconds(column: Any) -> Any:
     import pandas as pd
 
     first = column.dropna().iloc[:1]
-    seconds = first.dtype.kind not in "mM" and pd.to_numeric(first, errors="coerce").notna().all()
-    # Also as texts, as of a file read without types: else 2000 would be a year.
+    # By the text, as of a file read without types: else 2000 would be a year, and a period a number of days.
+    seconds = pd.to_numeric(first.astype(object).map(str), errors="coerce").notna().all()
     if seconds or first.empty:
         return _number(column, "time", "seconds or a time")
     # ISO 8601, as nearly all have it, or 31/12/2024 23:59:59 as the Danish AIS has it. Other orders of day and month
