@@ -195,6 +195,7 @@ def test_a_full_disk_under_standard_output_is_one_line(words: str, empty_folder:
     [
         (RunError("iteration 3: the loss is not finite"), 1, "iteration 3: the loss is not finite"),
         (Preempted(signal.SIGTERM), 143, "stopped by signal 15"),
+        (SystemExit(143), 143, "stopped by signal 15"),
         (MemoryError(), 1, "not enough memory"),
         (RuntimeError("[enforce fail] can't allocate memory: 8 bytes"), 1, "not enough memory"),
         (ImportError("libtorch_cpu.so: failed to map segment"), 1, "not enough memory"),
@@ -213,6 +214,19 @@ def test_a_run_that_breaks_down_ends_in_one_line(
     stub(monkeypatch, "train", run)
     assert main(["train"]) == status
     assert capsys.readouterr().err == f"trackmdp train: {line}\n"
+
+
+@pytest.mark.parametrize("own", [0, 200, "words"])
+def test_the_status_of_a_plugin_that_ends_the_program_is_its_own(
+    own: int | str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(cfg: Any, folder: Path) -> None:
+        sys.exit(own)
+
+    stub(monkeypatch, "train", run)
+    with pytest.raises(SystemExit) as ended:
+        main(["train"])
+    assert (ended.value.code, capsys.readouterr().err) == (own, "")
 
 
 def test_on_windows_one_line_says_where_it_runs(

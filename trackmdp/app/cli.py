@@ -9,6 +9,7 @@ import errno
 import io
 import os
 import platform
+import signal
 import sys
 import traceback
 from pathlib import Path
@@ -94,9 +95,10 @@ def _dispatch(words: list[str]) -> int:
             )
         return _run(command, words[1:])
     except SystemExit as error:
-        if (status := _signalled(error)) <= 128:  # argparse ends so after `--version`
+        number = _signalled(error) - 128
+        if number not in signal.valid_signals():  # argparse ends so after `--version`
             raise
-        return _report(command, Preempted(status - 128))
+        return _report(command, Preempted(number))
     except (Exception, KeyboardInterrupt, Preempted) as error:
         # Standard output has no file's name. If it has failed, it fails once more, which `main` reports.
         if isinstance(error, OSError) and not error.filename:
