@@ -197,6 +197,8 @@ def test_a_model_for_all_targets_is_refused_where_it_draws_or_reads_more() -> No
     with pytest.raises(UserError, match="policy: the model reads step_count, expected last_cell"):
         tm.evaluate(limited, Together(limited))
     group = tm.Group([WORLD] * 2)
+    with pytest.raises(UserError, match=r"reads last_cell of .*2\], got \[3\], of other targets"):
+        tm.evaluate(tm.Group([WORLD] * 3), Together(group))
     for act, name, message in (
         (lambda here: torch.rand(len(here), 9) < 0.5, "action", "draws at random"),
         (lambda here: here, "action", r"its action: expected .* \[9, 9\], got bool \[9, 2\]"),

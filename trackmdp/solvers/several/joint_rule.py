@@ -54,7 +54,7 @@ class JointRule(Rule):
 
         Raises:
             DrawsError: it draws.
-            UserError: it reads other keys, or its action has another form.
+            UserError: it reads other keys, or those of other targets or another grid; or its action has another form.
         """
         known = [*state_keys(group.task, group.targets), "action_mask"]
         module = isinstance(policy, TensorDictModuleBase)
@@ -74,6 +74,11 @@ class JointRule(Rule):
             if module:
                 return policy(TensorDict(seen, len(state[0]), device=device))["action"]
             arrays = {name: part.numpy() for name, part in seen.items()}
+            for name, part in arrays.items():
+                own = tuple(policy.observation_space.spaces[name].shape)
+                if own[-part.ndim + 1 :] != part.shape[1:]:
+                    found = f"the model reads {name} of {list(own)}, got {list(part.shape[1:])}"
+                    raise UserError(f"policy: {found}, of other targets or another grid")
             return torch.as_tensor(policy.predict(arrays, deterministic=True)[0])
 
         # A function has no weights, of which others would be made in double precision.
