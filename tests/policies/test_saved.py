@@ -73,6 +73,9 @@ def test_limits_and_probabilities_are_kept(tmp_path: Path) -> None:
         assert found.chosen(1, np.arange(6), np.arange(6)) == pytest.approx(
             policy.chosen(1, np.arange(6), np.arange(6))
         )
+    # Also without one of the sensors a single number stands for all sets: written out, they would be M² (t_max + 1).
+    Policy.all_on(Task(2, cost=[np.nan, 0.1, 0.1, 0.1])).save(tmp_path / "policy.npz")
+    assert Policy.load(tmp_path / "policy.npz").alike
 
 
 def test_the_place_of_the_grid_is_kept(tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ def packed(policy: PolicyTable) -> dict[str, Any]:
     sets, content = policy.sets, dict[str, Any]()
     if (
         policy.alike
-        and sets.nnz in (0, policy.task.total_sensors)
+        and sets.nnz in (0, policy.task.available.sum())
         and (sets.data == sets.data[:1]).all()
     ):
         content["probability"] = np.float64(sets.data[0] if sets.nnz else 0.0)
