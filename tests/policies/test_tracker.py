@@ -39,6 +39,7 @@ WORLDS: dict[str, Problem] = {
     "mode": tm.make_world("heading", size=3, reveals=True, t_max=2),
     "footprints": footprint_world(3),
     # Each cell but the first two is seen by two sensors, which both miss.
+    "faint cells": missing(coverage=np.eye(16) * 0.6),
     "faint footprints": missing(coverage=(np.eye(16) + np.eye(16, k=2)) * 0.6, safe_detection=0.6),
 }
 
@@ -173,7 +174,7 @@ def test_it_works_without_torch() -> None:
     assert after(code) == [list(range(9)), False]
 
 
-@pytest.mark.parametrize("name", ["paper", "keys", "footprints", "mode"])
+@pytest.mark.parametrize("name", ["paper", "keys", "footprints", "faint cells", "mode"])
 def test_a_file_of_onnx_acts_as_the_policy_without_torch(name: str, tmp_path: Path) -> None:
     """Its whole episode: memory, modes, footprints and misses are the tracker's, the sets those of the file."""
     pytest.importorskip("onnxruntime")
@@ -185,7 +186,7 @@ def test_a_file_of_onnx_acts_as_the_policy_without_torch(name: str, tmp_path: Pa
     known = world.revealed > 1
     for episode in tm.simulate(world, policy, 5, seed=3):
         mode = episode.start_mode if known else None
-        followed(tm.Tracker(file, episode.start, mode=mode), episode, world)
+        followed(tm.Tracker(file, episode.start, mode=mode, world=world), episode, world)
     cell, more = (3, {"mode": 1}) if known else (3, {})
     code = (
         "import sys, trackmdp as tm\n"

@@ -89,9 +89,12 @@ class Coverage:
         return self.matrix.T.tocsr()
 
     @cached_property
-    def mark(self) -> str:
-        """A digest of the cells of each sensor."""
+    def mark(self) -> str | None:
+        """A digest of the cells of each sensor; None where each covers the cell of its number, perhaps not surely."""
         parts = (self.matrix.indptr, self.matrix.indices)
+        own = all(np.array_equal(part, np.arange(len(part))) for part in parts)
+        if own and self.num_sensors == self.matrix.shape[1]:
+            return None
         return sha256(b"".join(each.astype(np.int64).tobytes() for each in parts)).hexdigest()[:16]
 
     def as_lists(self) -> list[list[int]]:
