@@ -321,6 +321,19 @@ def test_an_open_bracket_is_searched_again_from_other_starts(
     assert solution.lower >= evaluate(world, better).aihtr > alone.lower
 
 
+def test_a_start_with_as_many_keys_of_another_memory_is_left_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nine displacements and none, or ten modes."""
+    world = World(np.eye(20)[::-1] * 0.5, (1, 2), cost=0.3, modes=10, revealed=10)
+    start = PolicyTable.all_on(world.task.remembering("displacement", clip=1, revealed=1))
+    assert start.task.num_keys == world.num_keys
+    taken = list[PolicyTable | None]()
+    monkeypatch.setattr(optimal._Run, "search", lambda run: taken.append(run.start))
+    optimal.solve(world, start=start)
+    assert taken == [None]
+
+
 def test_where_the_state_is_known_at_a_detection_memory_changes_nothing() -> None:
     """Nor does a policy of other keys to start from, whose rows are not those of cells."""
     world = paper_world(5, 0.22, 1)

@@ -91,7 +91,7 @@ def solve(
         )
     if world.memory != "cell":  # the state is known at a detection: more of the past is of no use
         world = world.but(memory="cell")
-    if start is not None and start.task.num_keys != world.num_keys:
+    if start is not None and (start.task.order or start.task.num_keys != world.num_keys):
         start = None
     side = (
         region_side(world, memory) if has_trees(world) else None
