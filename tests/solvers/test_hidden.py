@@ -86,7 +86,9 @@ def test_annealed_and_crossed_policies_end_higher(monkeypatch: pytest.MonkeyPatc
             [evaluate(each, hidden.best_found(each, effort)).aihtr for each in (world, misses)]
         )
     (both, missed), (annealed, less), (led, least) = values
-    assert both >= annealed > 37.2789 > led
+    # Two policies that are mirror images differ in the last bit, on one processor and not on another.
+    assert both > annealed - 1e-9
+    assert annealed > 37.2789 > led
     assert missed > 11.1 > less > least
 
 
