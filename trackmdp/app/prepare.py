@@ -23,6 +23,7 @@ from trackmdp.config.logs import require_packages
 from trackmdp.config.resume import by_key, continued, key_of, run_folder
 from trackmdp.errors import RunError, UserError, message_of
 from trackmdp.imports import importing
+from trackmdp.machine import make_device
 
 if TYPE_CHECKING:
     from trackmdp.world.group import Subject
@@ -221,10 +222,8 @@ def _check_here(cfg: CommandConfig, folder: Path) -> None:
             newest(Path(cfg.init_from), "init_from")
     if {*devices.values()} != {"cpu"}:  # torch takes seconds
         with importing():
-            from trackmdp.machine import make_device
-
-        for key, name in devices.items():
-            make_device(name, key)
+            for key, name in devices.items():
+                make_device(name, key)
 
 
 def _check_runs(cfg: CommandConfig, runs: Sequence[str], words: Sequence[str]) -> None:

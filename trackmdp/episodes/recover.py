@@ -70,6 +70,9 @@ def taken_over(file: Path, target: Path, policies: int) -> EpisodeWriter | None:
 class _Parts:
     """Parts of a log that are whole, by name: metadata with their seal, and attachments; and all that was damaged."""
 
+    writer: EpisodeWriter | None = None
+    """Of the new log."""
+
     def __init__(self) -> None:
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, bytes] = {}
@@ -111,16 +114,16 @@ class _Parts:
                     found = container.messages_of(record, topics)
             yield from found
 
-    def begin(self, file: Path, target: Path) -> EpisodeWriter | None:
+    def begun(self, file: Path, target: Path) -> EpisodeWriter | None:
         """The new log, if all that it begins with has been found."""
-        if schema.RUN in self.metadata:
+        if self.writer is None and schema.RUN in self.metadata:
             said = self.metadata[schema.RUN]
             schema.check_format(file, said)
             with self.noting():
                 # Without the problem, the log could not be simulated again.
                 tables = {n: self.attached(n, said.get(f"{n}.sha256")) for n in TABLES}
-                return EpisodeWriter(target, said, tables)
-        return None
+                self.writer = EpisodeWriter(target, said, tables)
+        return self.writer
 
     def add_policies(self, writer: EpisodeWriter, count: int) -> None:
         """Copy policies until there are `count`."""
@@ -136,38 +139,42 @@ def _rewrite(
     file: Path, target: Path, most: float = math.inf
 ) -> tuple[EpisodeWriter | None, list[str]]:
     """Copy the whole parts of the first `most` policies and their episodes; None without metadata and problem."""
+    parts = _Parts()
+    try:
+        _copy(parts, file, target, most)
+    except BaseException:
+        if parts.writer is not None:
+            parts.writer.abandon()
+        raise
+    return parts.writer, parts.damaged
+
+
+def _copy(parts: _Parts, file: Path, target: Path, most: float) -> None:
     # From front to back, since a log that was cut off has no index: the messages of an episode are held until the
     # `/episode` message, which is its last one.
-    parts, held = _Parts(), list[Said]()
-    writer: EpisodeWriter | None = None
-    try:
-        with container.opened_log(file) as stream:
-            for message in container.fitting(file, parts.messages(stream)):
-                held.append(message)
-                if message[0] != "/episode":
-                    continue
-                writer = writer or parts.begin(file, target)
-                with parts.noting():
-                    if writer is None:
-                        raise Damaged("an episode without metadata or problem")
-                    row = json.loads(message[2])
-                    # A resumed run records the episodes of later policies again.
-                    if row["policy"] >= most:
-                        break
-                    parts.add_policies(writer, row["policy"] + 1)
-                    # Messages of another episode may be held as well, one with an end that was lost.
-                    writer.add(writer.form.decode(row, held))
-                held.clear()
-            writer = writer or parts.begin(file, target)
-        if held or schema.END not in parts.metadata:
-            parts.damaged.append("the end is missing")
-        if writer is not None:
-            # Policies without a whole episode too: `taken_over` counts them.
-            found = sum(name.startswith(f"{schema.POLICY}.") for name in parts.metadata)
+    held = list[Said]()
+    with container.opened_log(file) as stream:
+        for message in container.fitting(file, parts.messages(stream)):
+            held.append(message)
+            if message[0] != "/episode":
+                continue
+            writer = parts.begun(file, target)
             with parts.noting():
-                parts.add_policies(writer, int(min(found, most)))
-    except BaseException:
-        if writer is not None:
-            writer.abandon()
-        raise
-    return writer, parts.damaged
+                if writer is None:
+                    raise Damaged("an episode without metadata or problem")
+                row = json.loads(message[2])
+                # A resumed run records the episodes of later policies again.
+                if row["policy"] >= most:
+                    break
+                parts.add_policies(writer, row["policy"] + 1)
+                # Messages of another episode may be held as well, one with an end that was lost.
+                writer.add(writer.form.decode(row, held))
+            held.clear()
+        writer = parts.begun(file, target)
+    if held or schema.END not in parts.metadata:
+        parts.damaged.append("the end is missing")
+    if writer is not None:
+        # Policies without a whole episode too: `taken_over` counts them.
+        found = sum(name.startswith(f"{schema.POLICY}.") for name in parts.metadata)
+        with parts.noting():
+            parts.add_policies(writer, int(min(found, most)))

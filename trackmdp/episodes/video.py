@@ -69,12 +69,14 @@ def _write_gif(part: Path, drawn: Iterator[None], canvas: Any, speed: int) -> No
         for _ in drawn:
             canvas.draw()
             now = Image.fromarray(np.array(canvas.buffer_rgba())[..., :3])
-            changed = before is None or ImageChops.difference(before, now).getbbox()
-            # All of the first one; of one like the one before a pixel, so that it takes its time.
-            box = (0, 0, *now.size) if changed is True else changed or (0, 0, 1, 1)
-            image, before = now.crop(box).quantize(64), now
-            if changed is True:
+            box: Any = (0, 0, *now.size)
+            if before is not None:
+                # Of one like the one before a pixel, so that it takes its time.
+                box = ImageChops.difference(before, now).getbbox() or (0, 0, 1, 1)
+            image = now.crop(box).quantize(64)
+            if before is None:
                 stream.writelines(getheader(image, info={"loop": 0})[0])
+            before = now
             look = {"duration": 1000 // speed, "include_color_table": True}
             stream.writelines(getdata(image, box[:2], **look))
         stream.write(b";")

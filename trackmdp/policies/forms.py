@@ -5,7 +5,7 @@ A rule is the common form: it maps states to sets of sensors.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from inspect import signature
 from typing import Any, TypeAlias
 
@@ -113,20 +113,40 @@ def _predicted(task: Task | None, model: Any) -> Callable[..., Any]:
         UserError: it reads more than a function is given, and the mask.
     """
     known = (*STATE_KEYS, "action_mask")
-    if others := sorted({*getattr(model.observation_space, "spaces", known)} - {*known}):
+    check_reads(getattr(model.observation_space, "spaces", known), known)
+    mask = None if task is None else ActionMask(task)
+
+    def function(*state: Tensor) -> Any:
+        seen = dict(zip(STATE_KEYS, state, strict=True))
+        if mask is not None and mask.observed:
+            seen["action_mask"] = mask(state[0])
+        return mode_of(model, seen)
+
+    return function
+
+
+def check_reads(keys: Iterable[Any], known: Sequence[str]) -> None:
+    """Raise a `UserError` if a model reads keys that are not shown."""
+    if others := sorted({*map(str, keys)} - {*known}):
         raise UserError(
             f"policy: the model reads {', '.join(others)}, expected {', '.join(known)} at most"
         )
 
-    mask = None if task is None else ActionMask(task)
 
-    def function(*state: Tensor) -> Any:
-        seen = {key: value.numpy() for key, value in zip(STATE_KEYS, state, strict=True)}
-        if mask is not None and mask.observed:
-            seen["action_mask"] = mask(state[0]).numpy()
-        return model.predict(seen, deterministic=True)[0]
+def mode_of(model: Any, state: Mapping[str, Tensor]) -> Any:
+    """The most likely actions of a model of Stable-Baselines3 in states `[B]`.
 
-    return function
+    Raises:
+        UserError: it reads states of another shape.
+    """
+    spaces = getattr(model.observation_space, "spaces", {})
+    for name, part in state.items():
+        own = tuple(spaces[name].shape) if name in spaces else tuple(part.shape[1:])
+        if own[len(own) - part.ndim + 1 :] != part.shape[1:]:
+            found = f"the model reads {name} of {list(own)}, got {list(part.shape[1:])}"
+            raise UserError(f"policy: {found}, of other targets or another grid")
+    seen = {name: part.numpy() for name, part in state.items()}
+    return model.predict(seen, deterministic=True)[0]
 
 
 def rule_of(task: Task, policy: TensorDictModuleBase | Callable[..., Any]) -> Rule:

@@ -54,8 +54,10 @@ def redrawn(
         if len(moves.moves) > _MOST_MOVES:
             break
         # A draw looks at the next two cells: every third one is drawn at once.
-        for turn in np.unique(at % 3):
+        for turn in range(3):
             own = np.flatnonzero(at % 3 == turn)
+            if not len(own):
+                continue
             mode = moves.headings(line)
             for part in np.array_split(own, 1 + len(own) * len(moves.moves) // _AT_ONCE):
                 place = at[part]

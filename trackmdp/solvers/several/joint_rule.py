@@ -19,7 +19,7 @@ from trackmdp.arrays.files import npz_bytes
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.durable import write_bytes
 from trackmdp.errors import UserError, output_of
-from trackmdp.policies.forms import DrawsError, state_keys
+from trackmdp.policies.forms import DrawsError, check_reads, mode_of, state_keys
 from trackmdp.seeding import preserved_global_rng
 from trackmdp.sensing.actions import checked_action
 from trackmdp.solvers.several.beliefs import Beliefs, Clocks
@@ -59,11 +59,7 @@ class JointRule(Rule):
         known = [*state_keys(group.task, group.targets), "action_mask"]
         module = isinstance(policy, TensorDictModuleBase)
         names = list(policy.in_keys if module else policy.observation_space.spaces)
-        if others := sorted({*map(str, names)} - {*known}):
-            wanted = ", ".join(known)
-            raise UserError(
-                f"policy: the model reads {', '.join(others)}, expected {wanted} at most"
-            )
+        check_reads(names, known)
         if module and "action" not in policy.out_keys:
             raise UserError("policy: the module writes no action")
         weights = policy.parameters() if module else ()
@@ -73,13 +69,7 @@ class JointRule(Rule):
             seen = dict(zip(names, state, strict=True))
             if module:
                 return policy(TensorDict(seen, len(state[0]), device=device))["action"]
-            arrays = {name: part.numpy() for name, part in seen.items()}
-            for name, part in arrays.items():
-                own = tuple(policy.observation_space.spaces[name].shape)
-                if own[-part.ndim + 1 :] != part.shape[1:]:
-                    found = f"the model reads {name} of {list(own)}, got {list(part.shape[1:])}"
-                    raise UserError(f"policy: {found}, of other targets or another grid")
-            return torch.as_tensor(policy.predict(arrays, deterministic=True)[0])
+            return torch.as_tensor(mode_of(policy, seen))
 
         # A function has no weights, of which others would be made in double precision.
         rule = cls(group, TensorDictModule(action, names, ["action"]), device)
