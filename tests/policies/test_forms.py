@@ -159,6 +159,8 @@ def test_a_model_of_stable_baselines_is_given_the_mask_and_refused_where_it_read
     cost[3] = np.nan
     world = tm.make_world("random_walk", size=3, cost=cost)
     assert tm.evaluate(world, Model(world)).aihtr == tm.evaluate(world, "all_on").aihtr
+    with pytest.raises(UserError, match=r"action_history of .*9\], got .*16\], .*another grid"):
+        tm.evaluate(tm.make_world("random_walk", size=4, cost=0.1), Model(world))
     limited = tm.make_world("random_walk", size=3, max_steps=5)
     for call in (tm.evaluate, lambda *given: tm.simulate(*given, 1)):
         with pytest.raises(UserError, match="policy: the model reads step_count, expected last_ce"):
