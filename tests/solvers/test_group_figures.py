@@ -48,6 +48,23 @@ def test_intervals_that_are_soon_as_narrow_as_wanted_cover_what_they_say(
     assert 0.935 < covered / 2000 < 0.965
 
 
+@pytest.mark.parametrize(("on", "episodes"), [(3.0, 2**17), (2.0**17, 1024), (2.0**20, 256)])
+def test_episodes_are_fewer_where_many_sensors_are_on(
+    monkeypatch: pytest.MonkeyPatch, on: float, episodes: int
+) -> None:
+    """No number of them has the width that is wanted; 2**27 sensors are on at most, but in the first 256."""
+    rng = np.random.default_rng(3)
+
+    def drawn(rule: Any, count: int, *_: Any) -> Array:
+        totals = rng.normal(size=(count, 7))
+        totals[:, 3] = on
+        return totals
+
+    monkeypatch.setattr(group_value, "simulated", drawn)
+    found = group_value._played(Any, (1.0, (0.0, 0.0)), 1e-9, 0, None)
+    assert len(found.totals) == episodes
+
+
 def test_two_episodes_have_no_interval() -> None:
     found = GroupEvaluation(np.arange(14.0).reshape(2, 7), False, 5.0, (5.0, 1.0))
     assert found.aihtr.low is None

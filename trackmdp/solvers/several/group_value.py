@@ -32,6 +32,8 @@ _AT_ONCE = 2**13
 """Targets of all episodes of a batch, at most."""
 _MOST = 2**17
 """Episodes, at most."""
+_MOST_ON = 2**27
+"""Sensors on in all of them, about: minutes. A policy that has thousands on is known well enough long before."""
 
 
 def evaluate_group(
@@ -72,14 +74,15 @@ def _played(
         parts.append(simulated(rule, max(wanted - count, 1), seed, name))
         count = sum(map(len, parts))
         found = GroupEvaluation(np.concatenate(parts), False, *exact_steps)
-        now = found.reward_per_step
-        if episodes is not None or count >= _MOST or now.low is None or now.high is None:
+        now, on = found.reward_per_step, max(float(found.totals[:, 3].sum()), 1.0)
+        most = min(_MOST, int(count * (_MOST_ON / on)))
+        if episodes is not None or count >= most or now.low is None or now.high is None:
             return found
         half = (now.high - now.low) / 2
         if half <= width:
             return found
         # A little more than the law of the square root asks for, so that few rounds are needed.
-        wanted = min(math.ceil(count * min(1.05 * half / width, 3.0) ** 2), 8 * count, _MOST)
+        wanted = min(math.ceil(count * min(1.05 * half / width, 3.0) ** 2), 8 * count, most)
 
 
 def simulated(rule: Rule, episodes: int, seed: int, name: str) -> Array:
