@@ -263,10 +263,13 @@ def test_a_recorded_group_is_read_back(tmp_path: Path) -> None:
     assert evaluate(again, "none").aihtr == evaluate(targets, "none").aihtr
 
 
-@pytest.mark.parametrize("memory", ["cell", pytest.param("displacement", marks=pytest.mark.slow)])
-def test_a_plan_is_learned_and_its_sets_united(memory: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("memory", "window"),
+    [("cell", "null"), pytest.param("displacement", 1, marks=pytest.mark.slow)],
+)
+def test_a_plan_is_learned_and_its_sets_united(memory: str, window: Any, tmp_path: Path) -> None:
     words = ["kernel=tracks", f"kernel.path={write(tmp_path / 'a.csv', APART30)}", "grid.size=3"]
-    words.append(f"task.memory={memory}")
+    words += [f"task.memory={memory}", f"grid.window={window}"]
     few = ["algo.total_frames=2000", "algo.frames_per_batch=1000", "quiet=true"]
     run = tmp_path / "run"
     assert main(["train", *words, *few, "targets.count=2", f"hydra.run.dir={run}"]) == 0

@@ -25,7 +25,10 @@ from trackmdp.world.model import World
 @pytest.mark.parametrize(
     ("words", "refusal"),
     [
-        (["solve", "targets.count=2", "grid.window=2"], "grid.window=2: expected null"),
+        (
+            ["train", "algo=ppo", "targets.count=2", "grid.window=2"],
+            "grid.window=2: expected null with algo=ppo with targets.count=2",
+        ),
         (
             ["solve", "targets.count=2", "kernel=heading", "kernel.reveals=true"],
             "kernel.reveals=True: expected false",
@@ -99,8 +102,8 @@ def test_other_targets_and_policies_are_refused() -> None:
             Group(many)  # type: ignore[arg-type]
     with pytest.raises(UserError, match="target 1 has another grid, price or limit"):
         Group([world, world.but(t_max=1)])
-    with pytest.raises(UserError, match=r"grid.window=1, expected none with several targets"):
-        Group([world.but(window=1)] * 2)
+    with pytest.raises(UserError, match="window=1: expected null with algo=ppo"):
+        tm.train(Group([world.but(window=1)] * 2), "ppo")
     with pytest.raises(UserError, match="does not draw, for several targets"):
         evaluate(Group([world] * 2), Policy.random_k(world, 1))
     with pytest.raises(UserError, match="merge: an option of several targets"):

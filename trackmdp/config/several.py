@@ -35,11 +35,13 @@ class TargetsConfig(NodeConfig):
             raise refuse("sensor", root.sensor.name, f"perfect, miss or footprint {with_several}")
         learner: Any = getattr(root, "algo", None)
         joint = learner is not None and learner.joint
+        if joint and root.grid.window is not None:
+            every = f"null with algo={learner.name} {with_several}: all sensors can be chosen"
+            raise refuse("grid.window", root.grid.window, every)
         # The union of all targets' own sets, on recorded tracks and with modes, needs no prediction.
         united = (hides or not root.kernel.is_motion) and not joint and root.cost.budget is None
         own = root.task.memory if united else "cell"
         for place, value, expected in (
-            ("grid.window", root.grid.window, None),
             ("task.memory", root.task.memory, own),
             ("cost.mean_budget", getattr(root.cost, "mean_budget", None), None),
             ("verify", getattr(root, "verify", False), False),

@@ -37,7 +37,7 @@ class Tracking:
     dynamics: Dynamics | GroupDynamics
 
     def __init__(self, problem: Problem | Group, count: int, device: torch.device) -> None:
-        self.device, task, self.each = device, problem.single, len(problem.targets) or 1
+        self.device, task, self.each = device, problem.task, len(problem.targets) or 1
         self._t_max, self._cells = task.t_max, torch.arange(task.num_cells, device=device)
         missed = not (task.perfect and task.safe)
         if isinstance(problem, Group):

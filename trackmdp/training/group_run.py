@@ -200,7 +200,7 @@ def beside(
     found = partial(Several, group, rule.name, figures, upper)
     if group.recorded is not None:
         # Each target's sets together.
-        policies = {} if group.task.limited else fixed_policies(group.task)
+        policies = {} if group.task.limited else fixed_policies(group.single.task)
         fixed = {name: evaluate(group, policy) for name, policy in policies.items()}
         return found(None, None, fixed)
     if not cfg.enabled or group.task.max_steps is not None or group.modes > 1:

@@ -39,8 +39,8 @@ class Group(Carded):
             alone; see `of_tracks`. A policy of one of them may have a memory, the worlds have none.
 
     Raises:
-        UserError: they differ in more than the motion, or have a window, modes that a detection reveals or that a
-            budget goes with, or a memory without modes.
+        UserError: they differ in more than the motion, or have modes that a detection reveals or that a budget goes
+            with, or a memory without modes.
     """
 
     worlds: Sequence[World]
@@ -55,7 +55,6 @@ class Group(Carded):
             of_one = {
                 f"revealed={world.revealed}": world.revealed > 1,
                 f"budget={world.budget} and modes={world.modes}": world.modes > 1 and world.limited,
-                f"grid.window={world.window}": world.window is not None,
                 f"task.memory={world.memory}": world.memory != "cell" and world.modes == 1,
             }
             if name := next(filter(of_one.get, of_one), ""):
@@ -93,8 +92,11 @@ class Group(Carded):
 
     @cached_property
     def task(self) -> Task:
-        """Grid, prices and limits, the same for all targets; what a policy remembers is its own."""
-        return self.worlds[0].remembering()
+        """Grid, prices and limits, the same for all targets; what a policy remembers is its own.
+
+        A window limits each target's own plan: together any sensors can be chosen.
+        """
+        return replace(self.worlds[0].remembering(), window=None)
 
     @property
     def modes(self) -> int:

@@ -248,13 +248,14 @@ def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str | None = N
     """The policy for several targets that single ones make, merged by `gains`, or their plain `union`.
 
     None: by gains, but the union on recorded tracks, of which the moves pooled by cell say too little, with hidden
-    modes, where a plan's worth is no sum over cells, and of one set for all that may be known, such as `none`: gains
-    would make another policy of it. Else a budget needs gains.
+    modes, where a plan's worth is no sum over cells, and of one set for all that may be known, such as `none`, or all
+    sensors: gains would make another policy of it. Else a budget needs gains.
     """
     kinds, limited = {"gains": Merged, "union": Union}, group.task.limited
     one_set = all(each.alike for each in tables) and (
         len({each.sets.indices.tobytes() for each in tables}) == 1
     )
+    one_set |= all(map(_all_on, tables))
     if merge is None:
         known = group.recorded is None and group.modes == 1
         merge = "gains" if not one_set and (known or limited) else "union"
@@ -265,6 +266,12 @@ def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str | None = N
     if merge == "union" and limited and not one_set:
         raise UserError(f"targets.merge=union: expected gains with a budget, {group.task.budget}")
     return kinds[merge](group, tables)
+
+
+def _all_on(table: PolicyTable) -> bool:
+    """Whether every sensor is on that can be chosen, which with a window are others in each state."""
+    sets, every = table.sets, table.all_on(table.task).sets
+    return sets.shape == every.shape and sets.nnz == every.nnz
 
 
 def followed(
