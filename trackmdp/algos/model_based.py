@@ -45,6 +45,7 @@ from trackmdp.seeding import derive
 from trackmdp.sensing.task import Task
 from trackmdp.solvers import exchange, hidden
 from trackmdp.solvers.linear import DIRECT_CELLS
+from trackmdp.solvers.optimal import planned
 from trackmdp.solvers.value import value_of
 from trackmdp.world.model import World
 
@@ -168,7 +169,7 @@ class ModelBased(Checkpointed):
         """The plan for the posterior mean of the kernel; between batches one round from the plan before."""
         world = self._world(self._estimate.believed(self._least))
         if last or self._chooses:
-            plan = exchange.solve(world, exchange.OTHERS if last else 0)
+            plan = planned(world, exchange.OTHERS if last else 0)
         else:
             before = self._plan if self._plan is not None else PolicyTable.all_on(world)
             plan = exchange.improve(world, before, once=True)

@@ -20,6 +20,7 @@ import numpy as np
 from trackmdp.arrays.types import Array
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers import exchange
 from trackmdp.solvers.bounds import exact_clocked_table, of_cells
 from trackmdp.solvers.certify.branch import Tree
 from trackmdp.solvers.certify.budget import Budget, Shares
@@ -28,9 +29,9 @@ from trackmdp.solvers.certify.known import adopted, planted
 from trackmdp.solvers.certify.listing import best_plans
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.exchange import best_of, exchanged, other_starts, revealed
-from trackmdp.solvers.linear import RenewalSystem
+from trackmdp.solvers.linear import DIRECT_CELLS, RenewalSystem
 from trackmdp.solvers.motion_totals import expected_steps, forced_worth, grid_of
-from trackmdp.solvers.regions import improved, proved, region_side
+from trackmdp.solvers.regions import improved, proved, region_side, settled
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.rules import clocked_policy
 from trackmdp.solvers.search import Found, clocked_sets, follow_credit
@@ -51,6 +52,8 @@ NODES_A_CELL = 4
 """Nodes before improvements are used in regions, for each cell of the grid: more than most regions need."""
 WORTH_A_ROUND = 0.02
 """Share of the bracket that a round of ascent and exchange has to close to be followed by another one."""
+_ROUNDS = 5
+"""Of ascent and exchange without a proof, at most: the first three gain nearly all."""
 WORTH_A_RESTART = 0.02
 """Share of the bracket that improvements have to close for the search to start anew with them."""
 
@@ -93,9 +96,8 @@ def solve(
         world = world.but(memory="cell")
     if start is not None and (start.task.order or start.task.num_keys != world.num_keys):
         start = None
-    side = (
-        region_side(world, memory) if has_trees(world) else None
-    )  # there are no regions without one
+    # There are no regions without a tree.
+    side = region_side(world, memory) if has_trees(world) else None
     run = _Run(world, Budget(nodes, time_limit), tolerance, start, on_progress, side)
     interrupted = False
     try:
@@ -370,6 +372,15 @@ class _Run:
             interrupted,
             self.budget.timed_out and not self.certified,
         )
+
+
+def planned(world: World, starts: int) -> PolicyTable:
+    """A good policy without a proof: as of `exchange.solve`, on a large grid region by region, in bounded memory."""
+    if world.num_cells <= DIRECT_CELLS or not has_trees(world):
+        return exchange.solve(world, starts)
+    side = region_side(world)
+    assert side is not None
+    return settled(world, clocked_policy(world), side, _ROUNDS)
 
 
 def has_trees(world: World) -> bool:
