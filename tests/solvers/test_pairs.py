@@ -32,7 +32,7 @@ from trackmdp.policies.policy import Policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.recordings.tracks import Recorded
 from trackmdp.sensing.task import Task
-from trackmdp.solvers import bounds
+from trackmdp.solvers import bounds, value
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.solve import solve
@@ -143,6 +143,16 @@ def test_values_are_those_of_the_chain(problem: Problem, seed: int, draws: bool)
 @given(problems(), st.integers(0, 2**16), st.booleans())
 def test_values_of_many_more(problem: Problem, seed: int, draws: bool) -> None:
     check_values(problem, seed, draws)
+
+
+@settings(max_examples=40)
+@given(problems(), st.integers(0, 2**16), st.integers(1, 4))
+def test_values_do_not_depend_on_how_many_events_are_followed_at_once(
+    problem: Problem, seed: int, count: int
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(value, "_AT_ONCE", count)
+        check_values(problem, seed, draws=False)
 
 
 @settings(max_examples=60)

@@ -18,6 +18,7 @@ from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.exchange import exchange
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.solution import SearchProgress, Solution
+from trackmdp.solvers.value import value_of
 from trackmdp.world.make import make_world
 from trackmdp.world.model import World
 
@@ -170,3 +171,25 @@ def _world(size: int, **options: Any) -> World:
         **{"cost": 0.22, "safe_cost": 22.0, **options},
     )
     return replace(world, detection=np.full(world.num_cells, p_d))
+
+
+@pytest.mark.parametrize("t_max", [1, 2])
+def test_plans_without_proof_are_made_by_regions_on_large_grids(
+    t_max: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And with a budget, for which there are no regions, on the whole."""
+    world = make_world("drift", size=12, cost=0.3, t_max=t_max)
+    whole = value_of(world, optimal.plan_without_proof(world, 0))
+    monkeypatch.setattr(optimal, "DIRECT_CELLS", 100)
+    seen = list[World]()
+
+    def side(world: World) -> int:
+        seen.append(world)
+        return 5
+
+    monkeypatch.setattr(optimal, "widest_side", side)
+    found = value_of(world, optimal.plan_without_proof(world, 0))
+    assert found.aihtr > value_of(world, rules.clocked_policy(world)).aihtr + 0.01
+    assert found.aihtr == pytest.approx(whole.aihtr, abs=0.01)
+    optimal.plan_without_proof(world.but(budget=2), 0)
+    assert seen == [world]

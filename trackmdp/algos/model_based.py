@@ -45,7 +45,7 @@ from trackmdp.seeding import derive
 from trackmdp.sensing.task import Task
 from trackmdp.solvers import exchange, hidden
 from trackmdp.solvers.linear import DIRECT_CELLS
-from trackmdp.solvers.optimal import planned
+from trackmdp.solvers.optimal import plan_without_proof
 from trackmdp.solvers.value import value_of
 from trackmdp.world.model import World
 
@@ -154,7 +154,7 @@ class ModelBased(Checkpointed):
         """
         assert isinstance(self.policy, RenewedTable)
         drawn = self._world(next(self._estimate.samples(self._rng, 1)))
-        self.policy.renew(lifted(self.task, exchange.solve(drawn, 0)))
+        self.policy.renew(lifted(self.task, plan_without_proof(drawn, 0)))
 
     @property
     def _every(self) -> int:
@@ -169,7 +169,7 @@ class ModelBased(Checkpointed):
         """The plan for the posterior mean of the kernel; between batches one round from the plan before."""
         world = self._world(self._estimate.believed(self._least))
         if last or self._chooses:
-            plan = planned(world, exchange.OTHERS if last else 0)
+            plan = plan_without_proof(world, exchange.OTHERS if last else 0)
         else:
             before = self._plan if self._plan is not None else PolicyTable.all_on(world)
             plan = exchange.improve(world, before, once=True)

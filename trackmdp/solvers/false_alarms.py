@@ -128,7 +128,7 @@ def _reports(
     quiet = (1.0 - false_alarm) ** (place - earlier) * np.where(earlier, missed[entry], 1.0)
     first = quiet * np.where(mine, world.detection[target[entry]], false_alarm) * now[entry]
     begins = ends_of(np.bincount(step.rows[entry], minlength=m * m))
-    located = transition(first, begins, target[entry] * m + cell)
+    located = transition(first, begins, target[entry] * m + cell, m * m)
     inside = step.summed(now)
     right = per_row(step.rows[entry[mine]], first[mine], m * m)
     spent, sensors = (

@@ -20,7 +20,7 @@ class Passed:
     """One step of all B events at once.
 
     Attributes:
-        located: `[B, B]`, probability that this step ends a renewal, and with which event.
+        located: `[B, width]`, probability that this step ends a renewal, and with which event.
         totals: `[B, 6]`, expected reward, steps in the grid, detections, sensors on, safe actions and steps.
     """
 
@@ -56,9 +56,9 @@ def passed(
     reward, forced = task.reward * located - spent * inside, step.n == task.num_choices
     length = per_row(step.before, mass if step.goes_on is None else mass * step.goes_on, step.count)
     figures = [reward, inside, located, sensors * inside, forced * inside, length]
-    onward = transition(found, step.pointer, step.following)
+    onward = transition(found, step.pointer, step.following, step.width)
     if step.missed is not None:
-        onward = onward + transition(now - found, step.pointer, step.missed)
+        onward = onward + transition(now - found, step.pointer, step.missed, step.width)
     # Figure by figure in memory: put together, and summed over steps, five times as fast as event by event.
     return Passed(onward, np.array(figures).T), now - found
 
@@ -70,11 +70,13 @@ def passed_last(task: Task, motion: Motion, step: Step, mass: Array) -> Passed:
     return passed(task, step, mass, report, task.safe_cost, 0.0)[0]
 
 
-def transition(value: Array, pointer: IndexArray, columns: IndexArray) -> sparse.csr_array:
-    """`[B, B]` of entries `[E]` in order of their rows, which begin at `pointer`; those of 0 are left out."""
-    count = len(pointer) - 1
+def transition(
+    value: Array, pointer: IndexArray, columns: IndexArray, width: int
+) -> sparse.csr_array:
+    """`[B, width]` of entries `[E]` in order of their rows, which begin at `pointer`; those of 0 are left out."""
+    shape = len(pointer) - 1, width
     some = np.flatnonzero(value > 0)
     if len(some) < len(value):
         value, columns, pointer = value[some], columns[some], np.searchsorted(some, pointer)
     parts = (each.astype(index_type(len(value)), copy=False) for each in (columns, pointer))
-    return sparse.csr_array((value, *parts), shape=(count, count))
+    return sparse.csr_array((value, *parts), shape=shape)

@@ -31,7 +31,7 @@ from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.exchange import best_of, exchanged, other_starts, revealed
 from trackmdp.solvers.linear import DIRECT_CELLS, RenewalSystem
 from trackmdp.solvers.motion_totals import expected_steps, forced_worth, grid_of
-from trackmdp.solvers.regions import improved, proved, region_side, settled
+from trackmdp.solvers.regions import improved, proved, region_side, settled, widest_side
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.rules import clocked_policy
 from trackmdp.solvers.search import Found, clocked_sets, follow_credit
@@ -374,13 +374,11 @@ class _Run:
         )
 
 
-def planned(world: World, starts: int) -> PolicyTable:
+def plan_without_proof(world: World, starts: int) -> PolicyTable:
     """A good policy without a proof: as of `exchange.solve`, on a large grid region by region, in bounded memory."""
     if world.num_cells <= DIRECT_CELLS or not has_trees(world):
         return exchange.solve(world, starts)
-    side = region_side(world)
-    assert side is not None
-    return settled(world, clocked_policy(world), side, _ROUNDS)
+    return settled(world, clocked_policy(world), widest_side(world), _ROUNDS)
 
 
 def has_trees(world: World) -> bool:

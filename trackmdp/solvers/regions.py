@@ -118,16 +118,19 @@ def region_side(world: World, memory: str | None = None) -> int | None:
     whole, limit = _whole_bytes(world), free_bytes() if memory is None else parse_bytes(memory)
     if world.num_cells <= DIRECT_CELLS and whole + _region_bytes(world, max(world.size)) <= limit:
         return None
-    room, smallest = (ROOM, SMALLEST_SIDE) if memory is None else (min(ROOM, limit - whole), 1)
-    fits = [
-        side for side in range(smallest, LARGEST_SIDE + 1) if _region_bytes(world, side) <= room
-    ]
-    side = max(fits, default=smallest)
+    own = (ROOM, SMALLEST_SIDE) if memory is None else (min(ROOM, limit - whole), 1)
+    side = widest_side(world, *own)
     if (needed := whole + _region_bytes(world, side)) > limit:
         said = f"{gib(limit)} are available" if memory is None else "expected at least that"
         size = f"{world.rows} x {world.columns} cells need about {gib(needed)}"
         raise UserError(f"solver.memory={memory or 'null'}: {size}, {said}")
     return side
+
+
+def widest_side(world: World, room: int = ROOM, smallest: int = SMALLEST_SIDE) -> int:
+    """Located cells of a region in each direction, as many as `room` bytes hold, but at least `smallest`."""
+    sides = range(smallest, LARGEST_SIDE + 1)
+    return max((side for side in sides if _region_bytes(world, side) <= room), default=smallest)
 
 
 def _whole_bytes(world: World) -> int:

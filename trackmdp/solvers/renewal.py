@@ -147,7 +147,7 @@ class Renewal:
 
         `guessed`: a value near to the policy's is known, so that iteration is faster on a grid of some size.
         """
-        located, gathered = whole_renewals(self.passes(self.acts(sets)), self.count)
+        located, gathered = whole_renewals(self.passes(self.acts(sets)))
         direct = _DIRECT if guessed else DIRECT_CELLS
         tolerance = TOLERANCE if self.single else _SEARCHED
         system = RenewalSystem(located, self.groups, direct=direct, tolerance=tolerance)

@@ -12,6 +12,7 @@ becomes a backward recursion over them. Nothing diverges where the target never 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,6 +40,8 @@ if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its 
 _MOST_GROUPS, _EVENTS_A_GROUP = 1_500, 4
 """States up to which each is a group of its own, and events a state from which: else factors cost more than they
 spare."""
+_AT_ONCE = 2**14
+"""Events that are followed at once: on a million cells all together would take gigabytes."""
 
 
 def value_of(
@@ -76,8 +79,25 @@ def follow(task: Task, motion: Motion, policy: PolicyTable) -> tuple[Events, Ite
     return events, _steps(task, motion, events, acts)
 
 
-def _steps(task: Task, motion: Motion, events: Events, policy: SetTable) -> Iterator[Passed]:
-    walk, key = Walk(task, motion, events), events.key
+def _renewals(
+    task: Task, motion: Motion, policy: PolicyTable
+) -> tuple[Events, sparse.csr_array, Array]:
+    """The events that a policy leads to, K `[B, B]` and the totals `[B, 6]`; some events at a time."""
+    acts, found = policy.sensed_by(task), list[tuple[sparse.csr_array, Array]]()
+    events = all_events(task, policy.task.keys, motion, acts.reports)
+    for begin in range(0, len(events.codes), _AT_ONCE):
+        some = replace(events, codes=events.codes[begin : begin + _AT_ONCE])
+        found.append(whole_renewals(_steps(task, motion, some, acts, events)))
+    if len(found) == 1:
+        return events, *found[0]
+    located, gathered = zip(*found, strict=True)
+    return events, sparse.vstack(located, "csr"), np.concatenate(gathered)
+
+
+def _steps(
+    task: Task, motion: Motion, events: Events, policy: SetTable, every: Events | None = None
+) -> Iterator[Passed]:
+    walk, key = Walk(task, motion, events, every=every), events.key
     mass = np.ones(len(events.codes) - events.forced)
     for n in range(task.num_choices):
         step = walk.move()
@@ -133,8 +153,7 @@ def _by_length(events: Events, found: Iterable[Passed]) -> list[tuple[sparse.csr
 
 
 def _whole_episodes(world: World, policy: PolicyTable, guess: Array | None) -> Evaluation:
-    events, steps = follow(world, world.motion, policy)
-    located, gathered = whole_renewals(steps, len(events.codes))
+    events, located, gathered = _renewals(world, world.motion, policy)
     cells_alone = events.keys.num_classes == world.modes == 1
     if cells_alone and len(events.codes) > DIRECT_CELLS:
         return _iterated(world, located, gathered, guess)
@@ -146,13 +165,16 @@ def _whole_episodes(world: World, policy: PolicyTable, guess: Array | None) -> E
     return _figures(world, events, totals, error)
 
 
-def whole_renewals(steps: Iterable[Passed], count: int) -> tuple[sparse.csr_array, Array]:
-    """K `[B, B]` and the totals of whole renewals, `[B, 6]` as those of the steps."""
-    located, gathered = sparse.csr_array((count, count)), np.zeros((6, count)).T
-    for step in steps:
+def whole_renewals(steps: Iterable[Passed]) -> tuple[sparse.csr_array, Array]:
+    """K `[B, width]` and the totals of whole renewals, `[B, 6]` as those of the steps."""
+    each = iter(steps)
+    first = next(each)
+    located, gathered = first.located, first.totals
+    del first  # as in `_steps`
+    for step in each:
         located = located + step.located
-        gathered += step.totals
-        del step  # as in `_steps`
+        gathered = gathered + step.totals
+        del step
     return located, gathered
 
 
@@ -219,8 +241,7 @@ def visits_of(system: RenewalSystem, start: Array, guess: Array | None = None) -
 def key_visits(problem: Problem, policy: PolicyTable) -> Array:
     """`[keys]`, how often an episode's start or a detection leaves each key of a policy, expected."""
     motion = problem.motion
-    events, steps = follow(problem, motion, policy)
-    located, _ = whole_renewals(steps, len(events.codes))
+    events, located, _ = _renewals(problem, motion, policy)
     start = np.bincount(first_events(events, motion), minlength=len(events.codes))
     system = RenewalSystem(located, event_groups(motion, events.state))
     visits = visits_of(system, start / len(motion.first))
@@ -232,7 +253,7 @@ def price_at_exit(world: World, policy: PolicyTable) -> float:
     """Expected price of what is on, or due, on the exit step, free for a single target; starts are uniform."""
     events, found = follow(world, world.motion, policy)
     steps = list(found)
-    located, _ = whole_renewals(steps, len(events.codes))
+    located, _ = whole_renewals(steps)
     prices = [policy.spent(n, world.paid)[events.key] for n in range(world.num_choices)]
     prices.append(np.full(len(events.codes), world.safe_cost))
     exits = [step.totals[:, 5] - step.totals[:, 1] for step in steps]
@@ -248,7 +269,7 @@ def replay(task: Task, tracks: Tracks, policy: PolicyTable) -> ReplayedTracks:
     motion = tracks.motion()
     events, found = follow(task, motion, policy)
     steps, count = list(found), len(events.codes)
-    located, gathered = whole_renewals(steps, count)
+    located, gathered = whole_renewals(steps)
     place = tracks.places[events.state]
     totals = solve_onward(place, located, gathered)
     first = first_events(events, motion)

@@ -46,7 +46,8 @@ class Step:
         stay: `[E_before]`, probability of still being in the grid after the move.
         goes_on: `[E_before]`, whether there is a next step at all; None: everywhere (a recording may stop).
         begun: events that begin here, the last entries before the move.
-        count: B, of all events.
+        count: B, of the events that begin.
+        width: of all events.
     """
 
     n: int
@@ -60,6 +61,7 @@ class Step:
     goes_on: BoolArray | None
     begun: int
     count: int
+    width: int
 
     @cached_property
     def back(self) -> sparse.csc_array:
@@ -84,11 +86,21 @@ class Walk:
         task: its t_max and its safe action.
         motion: of the target.
         events: where renewals begin.
-        closed: whether `events` hold all that follow, so that steps lead to their numbers; else to codes.
+        closed: whether steps lead to the numbers of events; else to their codes.
+        every: all events, where `events` are a part of them.
     """
 
-    def __init__(self, task: Task, motion: Motion, events: Events, *, closed: bool = True) -> None:
+    def __init__(
+        self,
+        task: Task,
+        motion: Motion,
+        events: Events,
+        *,
+        closed: bool = True,
+        every: Events | None = None,
+    ) -> None:
         self._task, self._motion, self._events, self._closed = task, motion, events, closed
+        self._every = events if every is None else every
         count = len(events.codes) - events.forced
         self._rows: IndexArray = np.arange(count, dtype=index_type(len(events.codes)))
         self._states = events.state[:count]
@@ -173,6 +185,7 @@ class Walk:
             None if stops is None else ~stops,
             begun,
             len(self._events.codes),
+            len(self._every.codes),
         )
 
     def _after(
@@ -180,7 +193,7 @@ class Walk:
     ) -> tuple[IndexArray, IndexArray | None]:
         """`[E]` events after a detection, and after a missed safe action; None where there is none."""
         events, motion, keys = self._events, self._motion, self._events.keys
-        if self._closed and events.complete:
+        if self._closed and self._every.complete:
             return states, states + motion.num_states if misses else None
         key = events.key[rows]
         after = keys.next(key, self._n, motion.cell[states], states % motion.modes)
@@ -188,7 +201,7 @@ class Walk:
         if misses:
             found.append(forced_codes(keys, motion.num_states, key, states))
         if self._closed:
-            found = [np.searchsorted(events.codes, codes) for codes in found]
+            found = [np.searchsorted(self._every.codes, codes) for codes in found]
         return found[0], found[1] if misses else None
 
 
