@@ -40,9 +40,7 @@ def listed(
         left -= plans
         return left >= 0
 
-    return best_plans(
-        renewal.problem(value), none, slack, one_more[renewal.steps[-3].states], go_on
-    )
+    return best_plans(renewal.problem(value), none, slack, one_more[renewal.free[-2].states], go_on)
 
 
 @pytest.mark.parametrize("name", WORLDS)

@@ -75,7 +75,7 @@ def positions(world: World, policy: PolicyTable, value: Array) -> list[PositionE
     # W after n + 1 misses, best play from a known position: there are t_max - n sets left then.
     later = tables(InnerProblem.of(renewal, value), slack=1e-9, run=up_to(_MOST_NODES))[::-1]
     mass, estimates = np.ones(world.num_cells), []
-    for n, (step, sensed) in enumerate(zip(renewal.steps, renewal.sets(policy), strict=False)):
+    for n, (step, sensed) in enumerate(zip(renewal.free, renewal.sets(policy), strict=True)):
         predicted = mass @ step.moves
         before = per_row(step.before, mass, world.num_cells)
         left = ~sensed[:, 0]

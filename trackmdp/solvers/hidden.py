@@ -247,7 +247,9 @@ class Search:
 
     @property
     def _work(self) -> int:
-        return self._slower * max(sum(len(step.rows) for step in self.renewal.steps), 1)
+        return self._slower * max(
+            sum(len(step.rows) for step in [*self.renewal.free, self.renewal.last]), 1
+        )
 
     @property
     def _slower(self) -> int:

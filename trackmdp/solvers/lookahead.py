@@ -55,7 +55,7 @@ def solve(world: World, *, depth: int = 2, tail: Tail = "clocked") -> PolicyTabl
         problem = InnerProblem(renewal, detected, missed, ahead, first=n)
         sets.append(_first_set(problem, mass, states))
         report = renewal.choices[n].report(sets[-1])[:, 0]
-        mass, states = (mass @ renewal.steps[n].moves) * (1.0 - report), renewal.steps[n].states
+        mass, states = (mass @ renewal.free[n].moves) * (1.0 - report), renewal.free[n].states
     return renewal.table(sets)
 
 

@@ -302,7 +302,7 @@ class _Run:
         plans = renewal.problem(here.value)
         detected = world.reward + self.value
         one_more = revealed(world, detected, forced_worth(world, detected), 1)
-        states = renewal.steps[-3].states if world.t_max else renewal.states[: world.num_states]
+        states = renewal.free[-2].states if world.t_max else renewal.states[: world.num_states]
         listed = best_plans(plans, here.sets, self.slack, one_more[states], looked_at)
         if listed is None:
             return False

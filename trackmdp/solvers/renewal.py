@@ -53,7 +53,7 @@ class Renewal:
     Attributes:
         task, motion: as given.
         keys: of the policies.
-        steps: the free choices, and last the safe action.
+        free: the steps of the free choices.
         plans: `[K]`, the keys that can occur.
         owner: `[B]`, place in `plans` of the key of each event.
 
@@ -66,9 +66,14 @@ class Renewal:
         self.keys: KeySpace = task.keys
         self.events = all_events(task, self.keys, motion)
         check_room(task, motion, self.events)
-        walk = Walk(task, motion, self.events)
-        self.steps: list[Step] = [walk.move() for _ in range(task.num_choices + 1)]
+        self._walk = Walk(task, motion, self.events)
+        self.free: list[Step] = [self._walk.move() for _ in range(task.num_choices)]
         self.plans, self.owner = np.unique(self.events.key, return_inverse=True)
+
+    @cached_property
+    def last(self) -> Step:
+        """The step of the safe action, the largest one: made where something asks for it."""
+        return self._walk.move()
 
     @cached_property
     def choices(self) -> list[Decisions]:
@@ -76,7 +81,7 @@ class Renewal:
         located, cell = self.keys.cell(self.plans), self.motion.cell
         return [
             sensing(self.task, self.owner[step.rows], cell[step.states], len(self.plans), located)
-            for step in self.steps[:-1]
+            for step in self.free
         ]
 
     @property
@@ -129,10 +134,10 @@ class Renewal:
         """The steps of all events under a policy; sensors are not counted."""
         task, found = self.task, []
         mass = np.ones(self.normal)
-        for step, (report, spent) in zip(self.steps, acts, strict=False):
+        for step, (report, spent) in zip(self.free, acts, strict=True):
             now, mass = passed(task, step, mass, report, spent, 0.0)
             found.append(now)
-        return [*found, passed_last(task, self.motion, self.steps[-1], mass)]
+        return [*found, passed_last(task, self.motion, self.last, mass)]
 
     def acts(self, sets: Sequence[AnyArray]) -> Iterator[Act]:
         """Reports and prices of `sets`, or of sensors that are on with such probabilities."""
@@ -163,7 +168,7 @@ class Renewal:
             weight: `[B]`, of each event among those of its key; None: 1.
             credit: for each free choice `[Z]` optimistic gain of locating the target in a state over missing it.
         """
-        task, free = self.task, self.steps[:-1]
+        task, free = self.task, self.free
         detected = [task.reward + value[step.following] for step in free]
         if credit is not None:
             credit = [each[step.states] for each, step in zip(credit, free, strict=True)]
@@ -173,15 +178,15 @@ class Renewal:
     @cached_property
     def turns(self) -> list[Turn]:
         """Entries and decisions of the plans of all keys."""
-        rows = [self.owner[: self.normal], *(self.owner[step.rows] for step in self.steps)]
+        rows = [self.owner[: self.normal], *(self.owner[step.rows] for step in self.free)]
         return [
             Turn(*ends, step.moves, step.stay, choice, self.task.prices[choice.sensors])
-            for ends, step, choice in zip(pairwise(rows), self.steps, self.choices, strict=False)
+            for ends, step, choice in zip(pairwise(rows), self.free, self.choices, strict=True)
         ]
 
     def missed(self, value: Array) -> Array:
         """`[E]` worth of the target's being missed at the last free choice."""
-        task, last = self.task, self.steps[-1]
+        task, last = self.task, self.last
         worth = task.reward + value[last.following]
         if last.missed is not None:
             found = task.safe_detection[self.motion.cell[last.states]]

@@ -65,7 +65,7 @@ def plan_paths(
     """
     view = _View(paths)
     if start is None:
-        gains = [np.full(len(step.rows), paths.task.reward) for step in paths.renewal.steps[:-1]]
+        gains = [np.full(len(step.rows), paths.task.reward) for step in paths.renewal.free]
         first = _Counted(view, gains, paths.times, prior)
         plans, value = first.plans, paths.follow(first.table)
     else:
@@ -98,10 +98,10 @@ class _View:
         self._size = rows, columns = paths.task.size
         start = renewal.keys.cell(renewal.events.key)
         cells = renewal.motion.cell
-        self.cell = [cells[step.states] for step in renewal.steps[:-1]]
-        self.plan = [renewal.owner[step.rows] for step in renewal.steps[:-1]]
+        self.cell = [cells[step.states] for step in renewal.free]
+        self.plan = [renewal.owner[step.rows] for step in renewal.free]
         ends = [
-            (start[step.rows], cell) for step, cell in zip(renewal.steps, self.cell, strict=False)
+            (start[step.rows], cell) for step, cell in zip(renewal.free, self.cell, strict=True)
         ]
         far = [apart(columns, *pair) for pair in ends]
         seen = np.concatenate(far)
@@ -158,7 +158,7 @@ class _Counted:
         self._shared: list[PriorMeans] = []
         sets: list[sparse.csr_array] = []
         above = self._above()
-        for n, (step, gain) in enumerate(zip(renewal.steps, gains, strict=False)):
+        for n, (step, gain) in enumerate(zip(renewal.free, gains, strict=True)):
             mean = np.zeros((1, view.width))
             for level, (context, number) in enumerate(contexts):
                 mass = alive[level][step.rows]

@@ -60,7 +60,7 @@ class AlongPaths:
         """For each n `[E]`, worth of a report at each entry over a miss, discounted."""
         renewal, value, gains = self.paths.renewal, self.value, list[Array]()
         later = renewal.missed(value)
-        for (report, spent), step in reversed(list(zip(self.acts, renewal.steps, strict=False))):
+        for (report, spent), step in reversed(list(zip(self.acts, renewal.free, strict=False))):
             detected = renewal.task.reward + value[step.following]
             gains.insert(0, detected - later)
             gross = step.moves @ (report * detected + (1.0 - report) * later)
@@ -109,7 +109,7 @@ class Paths:
         """A policy on all paths, its plans in the order of `keys`."""
         renewal, acts = self.renewal, list[Act]()
         owner, cell = renewal.owner, renewal.motion.cell
-        for n, step in enumerate(renewal.steps[:-1]):
+        for n, step in enumerate(renewal.free):
             report = table.reports(n, owner[step.rows], cell[step.states])
             acts.append((report, table.spent(n, self.task.paid)[owner]))
         steps = renewal.passes(acts)

@@ -236,7 +236,7 @@ def _trees(paths: Paths, followed: AlongPaths, keys: IndexArray) -> Plans:
         """`[E]`, of the events at each entry."""
         return per_row(ways.entry[events], ways.weight[events] * worth, len(ways.mass)) / ways.mass
 
-    for step in renewal.steps[:-1]:
+    for step in renewal.free:
         some = np.flatnonzero(ways.weight[step.rows] > 0)
         ways.choose(*ways.moved(step.rows[some], cells[step.states[some]], task.num_cells))
         detected.append(mean(step.rows[some], task.reward + followed.value[step.following[some]]))

@@ -54,7 +54,7 @@ class InnerProblem:
     @property
     def steps(self) -> list[Step]:
         """Those of the sets to be chosen."""
-        return self.renewal.steps[self.first : self.first + self.length]
+        return self.renewal.free[self.first : self.first + self.length]
 
     @cached_property
     def turns(self) -> list[Turn]:

@@ -206,7 +206,7 @@ class Merged(Rule):
             # Behind the cells stand those in which the safe action has missed, if it does.
             values.append(policy.value[: self.cells])
             after = policy.plans().after(policy.sets)
-            for step, worth, (codes, found) in zip(renewal.steps, after, worths, strict=False):
+            for step, worth, (codes, found) in zip(renewal.free, after, worths, strict=True):
                 located, state = step.rows + kind * self.cells, step.states + kind * self.cells
                 codes.append(located.astype(np.int64) * states + state)
                 found.append(worth[:, 0])
