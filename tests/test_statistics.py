@@ -195,3 +195,16 @@ def test_intervals_over_tracks_cover() -> None:
             hits[name] += found.low <= truth[name] <= found.high
     # .93, less twice the error of the simulation, .008
     assert min(hits.values()) / trials >= 0.93 - 0.016, hits
+
+
+@pytest.mark.slow
+def test_intervals_of_differences_cover_where_policies_seldom_differ() -> None:
+    """On a fifth of 40 tracks: .96 of 4,000 samples, of the bootstrap alone .87 (s.e. .005)."""
+    rng, trials, hits = np.random.default_rng(0), 600, 0
+    for _ in range(trials):
+        found = ratio(np.where(rng.random(40) < 0.2, rng.normal(size=40), 0.0), np.ones(40))
+        assert found.low is not None
+        assert found.high is not None
+        hits += found.low <= 0.0 <= found.high
+    # .95, less twice the error of the simulation, .009
+    assert hits / trials >= 0.95 - 0.018
