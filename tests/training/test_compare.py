@@ -57,8 +57,9 @@ def test_differences_on_tracks_are_paired_over_targets() -> None:
     assert (
         "clocked earns" in found.sentences[0] and "more per track than none" in found.sentences[0]
     )
-    same = tm.compare(problem, {"a": clocked, "b": clocked}).sentences[0]
-    assert same.startswith("No difference between b and a is shown")
+    same = tm.compare(problem, {"a": clocked, "b": clocked})
+    assert same.sentences == ["No difference between b and a is shown; all tracks agree."]
+    assert (same.policies[1].difference.mean, same.policies[1].difference.low) == (0.0, None)
     assert none.difference.mean == 0.0
 
 

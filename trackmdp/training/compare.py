@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeAlias, TypeVar
 
@@ -17,7 +17,7 @@ from trackmdp.solvers.evaluate import group_rule, policy_table
 from trackmdp.solvers.several.group_value import evaluate_group
 from trackmdp.solvers.several.merging import Rule
 from trackmdp.solvers.value import replay, value_of
-from trackmdp.statistics import MeanInterval, ratio
+from trackmdp.statistics import FEWEST, MeanInterval, ratio
 from trackmdp.training.evaluator import estimated_qmdp
 from trackmdp.world.group import Group, Subject, check_problem
 
@@ -102,11 +102,13 @@ def _sentence(first: Compared, other: Compared, unit: str, *, exact: bool) -> st
         return (
             f"{other.name} earns {'the same as' if same else f'{more} than'} {first.name} (exact)."
         )
-    interval = f"the {unit}s are too few for an interval"
+    low, high = found.mean - _SAME, found.mean + _SAME
+    interval = f"all {unit}s agree" if found.n >= FEWEST else f"too few {unit}s for an interval"
     if found.low is not None and found.high is not None:
-        interval = f"95 % interval of the difference: {decimal(found.low)} to {decimal(found.high)}"
-        if found.low <= 0.0 <= found.high:
-            return f"No difference between {other.name} and {first.name} is shown; {interval}."
+        low, high = found.low, found.high
+        interval = f"95 % interval of the difference: {decimal(low)} to {decimal(high)}"
+    if low <= 0.0 <= high:
+        return f"No difference between {other.name} and {first.name} is shown; {interval}."
     return f"{other.name} earns {more} than {first.name}; {interval}."
 
 
@@ -168,7 +170,7 @@ def _on_tracks(problem: Recorded, tables: Mapping[str, PolicyTable]) -> Comparis
     rows = []
     for name, each in found.items():
         figures = each.intervals(tracks.names)
-        less = ratio(rewards[name] - first, count)
+        less = _spread(ratio(rewards[name] - first, count))
         rows.append(Compared(name, {key: figures[key] for key in FIGURES}, less))
     return Comparison(tuple(rows), len(tracks))
 
@@ -183,14 +185,26 @@ def _of_group(group: Group, rules: Mapping[str, Rule]) -> Comparison:
         found = {name: evaluate_group(rule, episodes=count) for name, rule in rules.items()}
         first, *_ = found.values()
     rows = tuple(
-        Compared(name, {key: getattr(each, key) for key in FIGURES}, each.less(first).aihtr)
+        Compared(name, {key: getattr(each, key) for key in FIGURES}, less)
         for name, each in found.items()
+        for less in [each.less(first).aihtr if exact else _spread(each.less(first).aihtr)]
     )
     units = first.units
     if not exact and group.recorded is None:
         # A figure that is exact, or has control variates, is no plain mean: differences are not those of the figures.
         units = (*units, ", differences over the same targets")
     return Comparison(rows, None if exact else len(first.totals), units)
+
+
+def _spread(less: MeanInterval) -> MeanInterval:
+    """A difference without an interval where all units agree: no spread is no estimate of the spread."""
+    if (
+        less.low is None
+        or less.high is None
+        or less.high - less.low > _SAME * max(abs(less.mean), 1.0)
+    ):
+        return less
+    return replace(less, low=None, high=None)
 
 
 M = TypeVar("M")
