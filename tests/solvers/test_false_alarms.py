@@ -6,6 +6,7 @@ import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -135,9 +136,12 @@ def test_the_bound_holds_for_the_best_trees_of_reports(seed: int, t_max: int) ->
     assert played.low <= bound.mean()
 
 
-def test_the_filter_without_false_alarms_is_the_clocked_policy() -> None:
+@pytest.mark.parametrize(
+    "more", [{}, {"budget": 1}, {"cost": np.where(np.arange(16) % 5, 0.2, np.nan)}]
+)
+def test_the_filter_without_false_alarms_is_the_clocked_policy(more: dict[str, Any]) -> None:
     """Then a report is certain, and what is left of the belief after a miss is what the policy takes it for."""
-    world = replace(small_world(4, exit_probability=0.05), detection=np.full(16, 0.9))
+    world = replace(small_world(4, exit_probability=0.05), detection=np.full(16, 0.9), **more)
     exact, played = evaluate(world, rules.clocked_policy(world)), simulate_filter(world, 0.0, 4000)
     error = played.totals[:, 0].std() / 4000**0.5
     assert abs(played.totals[:, 0].mean() - exact.aihtr) <= 3 * error

@@ -13,6 +13,7 @@ import numpy as np
 
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 from trackmdp.seeding import derive
+from trackmdp.sensing.choose import largest
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.evaluation import ReplayedTracks
 from trackmdp.solvers.false_alarms import check_alarms
@@ -51,7 +52,11 @@ def simulate_filter(
         predicted, forced = belief @ kernel, misses > world.t_max
         later = located[np.minimum(misses, world.t_max)]
         gain = predicted * world.detection * (world.reward + later)
-        on = (gain > world.cost * predicted.sum(axis=1, keepdims=True)) & ~forced[:, None]
+        price = world.prices * predicted.sum(axis=1, keepdims=True)
+        on = (gain > price) & ~forced[:, None]
+        if world.budget is not None:
+            net, each = (gain - price).reshape(-1, 1), np.repeat(np.arange(len(row)), m)
+            on &= largest(each, net, world.budget).reshape(on.shape)
         target = (moves[:, None] >= edges[target]).sum(axis=1)
         inside = target < m
         there = np.arange(m) == target[:, None]
@@ -61,10 +66,10 @@ def simulate_filter(
         declared, cell = _declared(world.reward, belief, reports, later)
         right = inside & (forced | (declared & (cell == target)))
         declared |= forced
-        price = np.where(forced, world.safe_cost, on @ world.cost)
+        spent = np.where(forced, world.safe_cost, on @ world.paid)
         counts = (inside, right, on.sum(axis=1) * inside, forced & inside, np.ones(len(row)))
         watched += on[inside].sum(axis=0)
-        totals[:, row] += np.stack([world.reward * right - price * inside, *counts])
+        totals[:, row] += np.stack([world.reward * right - spent * inside, *counts])
         misses = np.where(declared, 0, misses + 1)
         row, target, belief, misses = row[inside], target[inside], belief[inside], misses[inside]
     return ReplayedTracks(totals[:5].T, totals[5], watched)
