@@ -196,10 +196,13 @@ def test_a_large_system_is_iterated_to_the_same_value(monkeypatch: pytest.Monkey
 def test_what_has_no_exact_value_is_refused() -> None:
     world = small_world()
     policy = PolicyTable.all_on(world)
+    remembers = replace(world, memory="displacement")
+    keyed = PolicyTable(remembers, PolicyTable.all_on(remembers).written)
     for given, told in (
         ((replace(world, max_steps=5), policy, 0.1), "whole episodes"),
         ((replace(world, safe_detection=0.5), policy, 0.1), "a safe action that always locates"),
         ((world, PolicyTable(world, probability=0.5), 0.1), "does not draw"),
+        ((world, keyed, 0.1), "the cell alone"),
         ((world, policy, 1.0), "expected a probability below 1"),
         (
             (small_world(13), PolicyTable.all_on(small_world(13)), 0.1),

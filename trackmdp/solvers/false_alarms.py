@@ -37,16 +37,19 @@ def believed(problem: Problem, policy: PolicyTable, false_alarm: float) -> Evalu
 
     Args:
         problem: the problem; `detection` is p_d.
-        policy: deterministic.
+        policy: deterministic, with a plan for each cell.
         false_alarm: p_f, with which a sensor that is on reports the target in a step in which it is not there.
 
     Raises:
         UserError: there is no motion model or it has modes, p_f is no probability below 1, the grid has more than 144
-            cells, episodes are truncated, the safe action may miss, or the policy draws its sets.
+            cells, episodes are truncated, the safe action may miss, or the policy draws its sets or remembers more
+            than the cell.
     """
     world = check_alarms(problem, false_alarm)
-    if not policy.deterministic:
-        raise UserError(f"false_alarm={false_alarm}: expected a policy that does not draw its sets")
+    if not policy.deterministic or (policy.task.keyed and not policy.alike):
+        raise UserError(
+            f"false_alarm={false_alarm}: expected a policy that remembers the cell alone and does not draw its sets"
+        )
     m = world.num_cells
     # Event z M + b: the target is in z, and believed in b. Events of one cell twice are the multiples of M + 1.
     events = Events(world.remembering().keys, m, np.arange(m * m))
