@@ -31,6 +31,7 @@ from trackmdp.policies.belief import BeliefFilter
 from trackmdp.policies.policy import Policy
 from trackmdp.seeding import derive
 from trackmdp.sensing.outcomes import Costs
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.group import Group
 from trackmdp.world.model import World
 
@@ -184,6 +185,13 @@ def test_issued_actions_give_the_episode_again() -> None:
     assert not longer.action[1:].any()
 
 
+def test_playback_of_more_sensors_than_the_budget_is_refused() -> None:
+    world = dataclasses.replace(WORLD, budget=2)
+    Playback(world, np.eye(16, dtype=bool) | np.eye(16, k=1, dtype=bool))
+    with pytest.raises(UserError, match="playback: 3 sensors on in a step; expected 2"):
+        Playback(world, np.arange(16)[None] < 3)
+
+
 def test_playback_of_another_grid_is_refused() -> None:
     with pytest.raises(UserError, match=r"actions of \(9,\) sensors, expected 16"):
         Playback(WORLD, np.zeros((3, 9), dtype=bool))
@@ -254,6 +262,24 @@ def test_episodes_of_recorded_tracks_go_along_the_held_out_ones() -> None:
         assert episode.terminated == (path[-1] == setting.num_cells)
         assert episode.truncated != episode.terminated
     assert len({episode.start for episode in episodes}) > 1
+
+
+@pytest.mark.parametrize("coverage", [None, np.eye(9) + np.eye(9, k=1)])
+@pytest.mark.parametrize("made_for", [1.0, 0.5])
+def test_the_sensors_are_those_of_the_world_whatever_the_policy_was_made_for(
+    made_for: float, coverage: Any
+) -> None:
+    worlds = {
+        p: dataclasses.replace(small_world(), detection=p, coverage=coverage) for p in (1.0, 0.5)
+    }
+    world = worlds[1.5 - made_for]
+    sets = np.random.default_rng(0).random((9, 2, 9)) < 0.4
+    for table in (sets, sets * 0.5):
+        own = Policy.from_dense(worlds[made_for], table)
+        found = simulate(world, own, 500).figures().accuracy
+        assert found.mean == pytest.approx(
+            evaluate(world, own).accuracy, abs=4 * found.standard_error
+        )
 
 
 CHANGES: list[tuple[str, Any, str]] = [

@@ -112,11 +112,13 @@ class Actor:
 def actor_of(task: Task, policy: PolicyLike | Playback, costs: Costs) -> Actor:
     """The actor of a policy; a function or module that does not draw is turned into its table first.
 
+    The sensors that report are those of `task`: a policy may have been made for others.
+
     Raises:
         UserError: the policy is made for another grid, or is no policy.
     """
     if isinstance(policy, Playback):
-        return Actor(_writing(policy.task, costs, _issuing(policy)), 256)
+        return Actor(_writing(task, costs, _issuing(policy)), 256)
     try:
         made = as_policy(task, policy)
     except DrawsError:
@@ -126,9 +128,9 @@ def actor_of(task: Task, policy: PolicyLike | Playback, costs: Costs) -> Actor:
         ask = _remembering(told, policy, most_rows) if recurrent else _asking(rule_of(told, policy))
         return Actor(_writing(told, costs, _with_history(told, ask, most_rows)), most_rows)
     if made.deterministic:
-        return Actor(_following(made, costs), _MOST_ROWS, made)
+        return Actor(_following(task, made, costs), _MOST_ROWS, made)
     drawing = _writing(
-        made.task, costs, lambda states, draws: made.act(states.key, states.misses, draws)
+        task, costs, lambda states, draws: made.act(states.key, states.misses, draws)
     )
     draws = made.task.total_sensors
     return Actor(drawing, max(1, min(256, _DRAWS // draws)), made, draws)
@@ -149,15 +151,15 @@ def _writing(task: Task, costs: Costs, action_of: Acts) -> Decides:
     return decide
 
 
-def _following(policy: Policy, costs: Costs) -> Decides:
+def _following(task: Task, policy: Policy, costs: Costs) -> Decides:
     """A deterministic policy: the row of its table for each state."""
     sets, table = policy.sets, policy.lookup(torch.device("cpu"))
-    if policy.task.coverage is not None:
-        table = Lookup(policy.reporting, table.device)
+    if task.coverage is not None:
+        table = Lookup(policy.sensed_by(task).reporting, table.device)
     # A CSR matrix's indptr is the place where each row's entries begin: 0 2 2 5 are rows of 2, 0 and 3 sensors.
     count, spent = torch.as_tensor(np.diff(sets.indptr).astype(np.int64)), costs.of_sets(sets)
 
-    detection = Detection(policy.task)
+    detection = Detection(task)
 
     def decide(states: States, draws: Tensor | None) -> Choice:  # noqa: ARG001
         row = policy.row(states.key, states.misses)
