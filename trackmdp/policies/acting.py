@@ -98,7 +98,7 @@ class Playback:
         actions: `[T, S]` bool, in their order.
 
     Raises:
-        UserError: the actions are those of another grid.
+        UserError: the actions are those of another grid, or exceed the budget.
     """
 
     def __init__(self, task: Task, actions: BoolArray) -> None:
@@ -106,6 +106,8 @@ class Playback:
             raise UserError(
                 f"playback: actions of {actions.shape[1:]} sensors, expected {task.total_sensors}"
             )
+        if task.budget is not None and (most := actions.sum(axis=1).max(initial=0)) > task.budget:
+            raise UserError(f"playback: {most} sensors on in a step; expected {task.budget}")
         self.task = task
         self.actions = torch.as_tensor(actions, dtype=torch.bool)
 
