@@ -33,6 +33,12 @@ def test_weights_are_the_inverse_of_the_probability_of_being_known() -> None:
     weights = report_weights(TASK, torch.device("cpu"))
     assert weights is not None
     assert weights.tolist() == [1.0, 2.0, 4.0, 1.0]
+    # of both sensors together: .5, 1 - .5 · .5 and .25
+    footprints = [[1.0, 1.0, 0.0], [0.0, 1.0, 0.5]]
+    shared = Task((1, 3), cost=0.1, t_max=0, detection=0.5, coverage=footprints)
+    weights = report_weights(shared, torch.device("cpu"))
+    assert weights is not None
+    assert weights.tolist() == pytest.approx([2.0, 4 / 3, 4.0, 1.0])
     assert report_weights(small_world(), torch.device("cpu")) is None
 
 

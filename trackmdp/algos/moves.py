@@ -9,11 +9,14 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from scipy import sparse
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
 
+from trackmdp.sensing.coverage import reported
 from trackmdp.sensing.task import Task
 
 
@@ -68,11 +71,15 @@ def report_weights(task: Task, device: torch.device) -> Tensor | None:
     """`[M + 1]` 1 / p_d of a path's step to each cell (or key), 1 for the exit; None where no sensor misses.
 
     A path is known only where it was reported at every step, with probability Π p_d(x_k): weighted by the inverse of
-    that, those known stand for all (Horvitz and Thompson 1952).
+    that, those known stand for all (Horvitz and Thompson 1952). Of footprints p_d is that of all sensors together.
     """
     if task.perfect:
         return None
-    weights = (1.0 / torch.as_tensor(task.detection, device=device)).repeat_interleave(
+    chance = task.detection
+    if task.coverage is not None:
+        every = sparse.csr_array(task.available[None].astype(np.float64))
+        chance = reported(every, task.sees_by_cell.T.tocsr()).toarray()[0]
+    weights = (1.0 / torch.as_tensor(chance, device=device)).repeat_interleave(
         task.keys.num_classes
     )
     return pad(weights, (0, 1), value=1.0)
