@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy import sparse
 
+import trackmdp as tm
+from tests.helpers import small_world
 from tests.reports.sweeps import write_sweep
 from trackmdp.reports import maps
-from trackmdp.reports.finished import after_a_miss
+from trackmdp.reports.finished import after_a_miss, read_map
 from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.idea import idea_figure, scenes
 from trackmdp.reports.results import Mapped
@@ -154,9 +158,25 @@ def test_after_a_miss_a_target_goes_on_in_its_mode_and_may_be_where_a_sensor_mis
     world = World(moves.reshape(10, 10), (1, 5), cost=0.1, modes=2)
     dark = sparse.csr_array((5, 5))
     assert after_a_miss(world, dark).toarray()[2].nonzero()[0].tolist() == [0, 4]
-    stay = World(0.9 * np.eye(5), (1, 5), cost=0.1, detection=[1, 0.5, 0.5, 1, 1])
-    found = after_a_miss(stay, sparse.csr_array(np.eye(5))).toarray()
+    stay = World(0.9 * np.eye(5), (1, 5), cost=0.1)
+    found = after_a_miss(stay, sparse.diags_array([1, 0.5, 0.5, 1, 1])).toarray()
     assert found == pytest.approx(np.diag([0, 0.405, 0.405, 0, 0]))
+
+
+@pytest.mark.slow
+def test_a_map_knows_that_footprints_miss(tmp_path: Path) -> None:
+    """Sensors that report next to their own cell with .5."""
+    coverage = np.eye(9) + 0.5 * np.eye(9, k=1)
+    world = replace(small_world(), coverage=coverage, cost=np.full(9, 0.01))
+    frames = {"total_frames": 1000, "frames_per_batch": 1000, "envs": 50}
+    run = tm.train(world, "model_based", folder=tmp_path / "a", **frames)
+    found = read_map(tmp_path / "a", SimpleNamespace(seed=0), "w", "m")  # type: ignore[arg-type]
+    assert found is not None
+    on = run.policy.dense()[:, 0]
+    silent = np.stack([np.prod(1.0 - coverage[each], axis=0) for each in on])
+    kernel = world.kernel.toarray()
+    assert found.after.toarray() == pytest.approx((kernel * silent) @ kernel)
+    assert (silent == 0.5).any()
 
 
 def test_where_a_sensor_misses_there_is_no_story() -> None:

@@ -157,10 +157,12 @@ def read_map(place: Path, run: FinishedRun, world: str, method: str) -> Mapped |
         raise UserError(f"{place / 'policy.npz'}: not the policy of this run")
     if not table.deterministic:
         raise UserError(f"{place / 'policy.npz'}: sets drawn at random, so that there is no map")
-    # `[keys (t_max + 1), M]`: cells in view of the sensors on.
-    sets = PolicyTable(table.task, table.written).seen
+    # `[keys (t_max + 1), M]`: cells in view of the sensors on, and the probability of a report there.
+    written = PolicyTable(table.task, table.written)
+    sets, reports = written.seen, written.reporting
     if table.task.keyed:
-        sets = averaged_sets(table, sets, key_visits(problem, table))
+        visits = key_visits(problem, table)
+        sets, reports = (averaged_sets(table, each, visits) for each in (sets, reports))
     kernel, bound, simple = _references_by_cell(problem)
     return Mapped(
         *(world, method, str(run.seed), table.task.size),
@@ -168,7 +170,7 @@ def read_map(place: Path, run: FinishedRun, world: str, method: str) -> Mapped |
         sets=sets.astype(np.float64),
         value=value,
         kernel=kernel,
-        after=after_a_miss(problem, sets[:: problem.num_choices]),
+        after=after_a_miss(problem, reports[:: problem.num_choices]),
         bound=bound,
         qmdp=simple,
     )
@@ -196,16 +198,16 @@ def averaged_sets(table: PolicyTable, sets: sparse.csr_array, visits: Array) -> 
 
 
 def after_a_miss(problem: World, first: sparse.csr_array) -> sparse.csr_array:
-    """`Mapped.after`, with the cells in view `first` `[M, M]` at once after a detection.
+    """`Mapped.after`, with the probability of a report in each cell `first` `[M, M]` at once after a detection.
 
-    Along the hidden states: the next move may depend on the last one. In a cell in view a miss has probability 1 - p_d.
+    Along the hidden states: the next move may depend on the last one.
     """
     m = problem.num_cells
     if m > MOST_MAP_CELLS:
         return sparse.csr_array((m, m))
     of_cell = summing(problem.motion.cell, m)
     mass = of_cell @ sparse.diags_array(mode_shares(problem)) @ problem.kernel
-    missed = mass - mass.multiply(first.multiply(problem.detection) @ of_cell)
+    missed = mass - mass.multiply(first @ of_cell)
     return sparse.csr_array(missed @ problem.kernel @ of_cell.T).sorted_indices()
 
 
