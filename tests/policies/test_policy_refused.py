@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from torchrl.modules import ProbabilisticActor
 
 from tests.helpers import small_world
 from tests.policies.test_policy import CHOICES, WORLD, M, table
+from trackmdp.environment.env import TrackEnv
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.sensing.task import Task
@@ -130,6 +132,12 @@ def test_a_state_that_is_none_is_refused(acting: Policy, key: str, value: int) -
     rows[key][1] = value
     with pytest.raises(UserError, match=f"{key}={value}"):
         acting(TensorDict(rows, [2]))
+
+
+def test_a_policy_of_keys_is_refused_where_none_are_observed() -> None:
+    remembers = Policy.all_on(replace(small_world(), memory="displacement"))
+    with pytest.raises(UserError, match=r"reads key.*memory=displacement"):
+        TrackEnv(small_world(), 2).rollout(2, policy=remembers)
 
 
 @pytest.mark.parametrize("k", [1.5, "2", True, -1, M + 1])

@@ -208,11 +208,14 @@ class Policy(TensorDictModuleBase, PolicyTable):
         """Write `action` `[*B, K]`: over all cells, or in the local numbers of the window around `last_cell`.
 
         Raises:
-            UserError: a cell, a key or a number of misses is none of this policy's task.
+            UserError: a cell, a key or a number of misses is none of this policy's task, or there are no keys.
         """
         last_cell, n = tensordict["last_cell"], tensordict["steps_since_detection"]
         name = "key" if self.task.keyed else "last_cell"
-        key = tensordict[name]
+        key = tensordict.get(name, None)
+        if key is None:
+            expected = f"a world with memory={self.task.memory}, revealed={self.task.revealed}"
+            raise UserError(f"policy: reads key, which is not observed here; expected {expected}")
         _check_range(name, key, self.task.num_keys)
         _check_range("steps_since_detection", n, self.task.num_choices + 1)
         if self.deterministic:
