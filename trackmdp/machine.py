@@ -119,9 +119,16 @@ def make_device(name: torch.device | str, key: str = "device") -> torch.device:
         return torch.device("cuda:0" if count else "cpu")
     try:
         device = torch.device(name)
-        if device.type != "cuda" or (device.index or 0) < count:
+        if device.type != "cuda":
+            torch.zeros(1, device=device).cpu()  # not there: `mps`, or without numbers: `meta`
             return device
-    except (RuntimeError, TypeError):  # no name of a device, or an index that is no C integer
+        if (device.index or 0) < count:
+            return device
+    except (
+        AssertionError,
+        RuntimeError,
+        TypeError,
+    ):  # no name of a device, or an index that is no C integer
         pass
     raise UserError(
         f"{key}={name}: no such device here ({count} CUDA devices found); use cpu or auto"

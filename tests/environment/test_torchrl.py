@@ -269,7 +269,7 @@ def test_its_signature_is_its_own_and_one_target_is_the_default() -> None:
     assert TrackEnv(small_world(), np.int64(4)).batch_size == (4,)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("wrong", ["8", 2.5, -1, (2, -3), None])
+@pytest.mark.parametrize("wrong", ["8", 2.5, -1, 0, (2, -3), (3, 0), None])
 def test_a_batch_size_that_is_none_is_named(wrong: Any) -> None:
     with pytest.raises(UserError, match=r"batch_size=.*expected a number of targets"):
         TrackEnv(small_world(), wrong)
@@ -279,6 +279,7 @@ def test_a_batch_size_that_is_none_is_named(wrong: Any) -> None:
     ("wrong", "message"),
     [
         (lambda: TrackEnv(small_world(), device="x"), "device=x: no such device here"),
+        (lambda: TrackEnv(small_world(), device="meta"), "device=meta: no such device here"),
         (lambda: TrackEnv(small_world()).to("x"), "device=x: no such device here"),
         (lambda: TrackEnv(small_world(), seed=-1), "seed=-1: expected an integer >= 0"),
         (lambda: TrackEnv(small_world()).set_seed(-1), "seed=-1: expected an integer >= 0"),

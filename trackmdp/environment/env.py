@@ -271,7 +271,7 @@ def _shape(batch_size: int | Sequence[int]) -> torch.Size:
         shape = torch.Size([operator.index(side) for side in sides])
     except TypeError:
         shape = torch.Size([-1])
-    if any(side < 0 for side in shape):
+    if any(side < 1 for side in shape):
         raise UserError(f"batch_size={batch_size}: expected a number of targets or their shape")
     return shape
 
