@@ -208,7 +208,7 @@ class Renewal:
     def priced_as(self, task: Task) -> Renewal:
         """The same renewal with the prices of another task."""
         other = copy.copy(self)
-        other.task = task
+        other.task, other.last = task, self.last  # the walk takes its last step once
         other.__dict__.pop("turns", None)
         return other
 
