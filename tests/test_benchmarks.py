@@ -157,6 +157,8 @@ def test_a_process_is_measured_from_start_to_end(tmp_path: Path) -> None:
     assert usage.peak_mib > 286
     assert usage.cpu_seconds > 0
     assert usage.wall_seconds > 0
+    with pytest.raises(UserError, match=f"{script} c: "):
+        clock.measured("c", script=str(script))
 
 
 def solver_in_n_squared_seconds(*typed: str, **_: Any) -> clock.Usage:

@@ -66,7 +66,7 @@ def measured(
         fails: the process is meant to fail.
 
     Raises:
-        CalledProcessError: the process failed.
+        UserError: the process failed; it has said why on stderr.
     """
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder, "usage.json")
@@ -75,14 +75,16 @@ def measured(
         # `python -c` would put the current folder before the checkout.
         chosen = {"PYTHONPATH": place, "PYTHONSAFEPATH": "1"} if place else {}
         started = time.perf_counter()
-        subprocess.run(
+        ended = subprocess.run(
             [python, "-c", _WRAPPER, str(report), *program, *words],
-            check=not fails,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL if fails else None,
             env={**os.environ, **chosen},
         )
         wall = time.perf_counter() - started
+        if ended.returncode and not fails:
+            named = " ".join([script or "trackmdp", *words])
+            raise UserError(f"{named}: status {ended.returncode}, expected 0; the reason is above")
         return Usage(wall, **json.loads(report.read_text()))
 
 

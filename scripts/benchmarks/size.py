@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
@@ -12,6 +11,7 @@ from pathlib import Path
 
 from benchmarks import clock
 from benchmarks.words import Row, as_words
+from trackmdp.errors import UserError
 
 COSTS = (0.16, 0.22)
 """Prices: at the first beliefs hardly spread, at the second all probabilities lie below c/r."""
@@ -71,7 +71,7 @@ def _measured(kind: str, words: list[str]) -> Row:
                 return row | {"peak_mib": usage.peak_mib, "per_second": result["per_second"]}
             usage = clock.measured(kind, *words, "quiet=true", f"hydra.run.dir={run}")
         # A size that is refused is a result, and the larger sizes are still of interest.
-        except subprocess.CalledProcessError:
+        except UserError:
             return row
         name = "solution.json" if kind == "solve" else "summary.json"
         regret = json.loads((run / name).read_text())["regret_per_step"]
