@@ -32,6 +32,7 @@ def script(capsys: pytest.CaptureFixture[str]) -> str:
         ("trackmdp train algo=pp", {"algo=ppo", "algo=ppo_per_sensor"}, {"algo=dqn"}),
         ("trackmdp train kernel=", {"kernel=drift", "kernel=tracks"}, {"kernel=given"}),
         ("trackmdp evaluate grid.t", {"grid.t_max="}, {"grid.size="}),
+        ("trackmdp compare run", {"runs="}, {"runs."}),
     ],
 )
 def test_a_line_is_completed(

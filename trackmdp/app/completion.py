@@ -6,6 +6,10 @@ Hydra's own script asks the program for the choices of its first word, and so `t
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
+
+from hydra._internal.hydra import Hydra
+from omegaconf import OmegaConf
 
 _SCRIPT = """\
 _trackmdp() {
@@ -31,3 +35,15 @@ complete -o nospace -o default -F _trackmdp trackmdp
 def bash(commands: Iterable[str]) -> str:
     """The script that bash evaluates; `commands` are the words that may follow `trackmdp`."""
     return _SCRIPT % {"commands": " ".join(commands)}
+
+
+def complete_line(hydra: Hydra, command: str) -> None:
+    """Print how the line in COMP_LINE may go on; `command` is its config."""
+    composed = hydra.config_loader.load_configuration
+
+    def untyped(*given: Any, **named: Any) -> Any:
+        # Hydra takes an option whose type is a list for a group of options, and ends it with a dot.
+        return OmegaConf.create(OmegaConf.to_container(composed(*given, **named)))
+
+    hydra.config_loader.load_configuration = untyped  # type: ignore[method-assign]
+    hydra.shell_completion(command, ["query=bash"])

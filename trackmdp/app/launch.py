@@ -22,7 +22,7 @@ from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 
 from trackmdp import __version__
-from trackmdp.app.completion import bash
+from trackmdp.app.completion import bash, complete_line
 from trackmdp.app.composer import Composer
 from trackmdp.app.prepare import (
     Prepared,
@@ -245,7 +245,7 @@ def answer(compose: Composer, args: argparse.Namespace) -> bool:
             elif compose.words == ["install=bash"]:
                 sys.stdout.write(bash([*ROOTS, "example"]))
             elif compose.words == ["query=bash"]:
-                hydra.shell_completion(compose.name, compose.words)
+                complete_line(hydra, compose.name)
             else:  # Hydra's own scripts know no commands
                 given = " ".join(compose.words)
                 raise UserError(f"--shell-completion {given}: expected install=bash or query=bash")
