@@ -184,25 +184,37 @@ class CompareConfig(WorldConfig):
                 raise refuse("baseline", name, f"one of {', '.join(known)}")
 
 
-class SolveConfig(WorldConfig):
-    """Solve the world with its motion model."""
+class WholeEpisodesConfig(WorldConfig):
+    """Common options of the commands about episodes that only the exit ends."""
+
+    def check(self, key: str, root: Any) -> None:
+        """No limit ends an episode."""
+        if self.grid.max_steps is not None:
+            raise refuse("grid.max_steps", self.grid.max_steps, "null, for whole episodes")
+
+
+class SolverConfig(WholeEpisodesConfig):
+    """Common options of the commands that solve."""
 
     task: TaskConfig
     solver: BaselineConfig
+
+
+class SolveConfig(SolverConfig):
+    """Solve the world with its motion model."""
+
     targets: TargetsConfig
     partition: SweptPartitionConfig
     verify: bool = option("check the paper's theorems on this world as well")
 
 
-class FrontierConfig(WorldConfig):
+class FrontierConfig(SolverConfig):
     """Accuracy against sensors per step, over all prices of a sensor: the best policies, with a proof.
 
     D stays as it is, and its payments count; cost.safe=0 leaves them out.
     """
 
     all_prices = True
-    task: TaskConfig
-    solver: BaselineConfig
     accuracy: float | None = share_option(
         "show the mixture of policies of the frontier that has this accuracy"
     )
@@ -213,13 +225,8 @@ class FrontierConfig(WorldConfig):
         "height above an edge below which no further corner is looked for, in accuracy", gt=0, lt=1
     )
 
-    def check(self, key: str, root: Any) -> None:
-        """Whole episodes alone are solved."""
-        if self.grid.max_steps is not None:
-            raise refuse("grid.max_steps", self.grid.max_steps, "null: whole episodes are solved")
 
-
-class VerifyConfig(WorldConfig):
+class VerifyConfig(WholeEpisodesConfig):
     """Check the paper's theorems on a world."""
 
     any_number = True
@@ -227,6 +234,7 @@ class VerifyConfig(WorldConfig):
 
     def check(self, key: str, root: Any) -> None:
         """The theorems are on sensors of one cell."""
+        super().check(key, root)
         if self.sensor.covers:
             raise refuse(
                 "sensor",

@@ -33,22 +33,11 @@ from trackmdp.world.problem import Problem
 
 @overload
 def simulate(
-    problem: Problem,
-    policy: PolicyLike | Playback,
-    episodes: int,
-    *,
-    seed: int = ...,
-    names: Sequence[str | int] = ...,
+    problem: Problem, policy: PolicyLike | Playback, episodes: int, **options: Any
 ) -> Episodes: ...
 @overload
 def simulate(
-    problem: Group,
-    policy: PolicyLike | Rule,
-    episodes: int,
-    *,
-    seed: int = ...,
-    names: Sequence[str | int] = ...,
-    merge: str | None = ...,
+    problem: Group, policy: PolicyLike | Rule, episodes: int, **options: Any
 ) -> GroupEpisodes: ...
 
 

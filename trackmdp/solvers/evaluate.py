@@ -24,20 +24,10 @@ if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its 
 
 @overload
 def evaluate(
-    problem: Problem,
-    policy: PolicyLike | Array | BoolArray,
-    *,
-    false_alarm: float = ...,
+    problem: Problem, policy: PolicyLike | Array | BoolArray, *, false_alarm: float = ...
 ) -> Evaluation: ...
 @overload
-def evaluate(
-    problem: Group,
-    policy: PolicyLike,
-    *,
-    merge: str | None = ...,
-    width: float = ...,
-    seed: int = ...,
-) -> GroupEvaluation: ...
+def evaluate(problem: Group, policy: PolicyLike, **of_group: Any) -> GroupEvaluation: ...
 
 
 def evaluate(

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from operator import attrgetter
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from scipy import sparse
@@ -28,7 +28,7 @@ from trackmdp.solvers.exchange import exchanged, other_starts
 from trackmdp.solvers.linear import accumulate
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.search import Found, clocked_sets, follow_credit, mixed
-from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
+from trackmdp.solvers.solution import OnProgress, SearchProgress, Solution, bracketed
 from trackmdp.world.model import World
 
 _STEPS, _SWEEPS = 12, 1
@@ -76,33 +76,26 @@ fifths of the time."""
 def solve(
     world: World,
     *,
-    nodes: int = 5_000_000,
+    start: PolicyTable | None = None,
+    on_progress: OnProgress = None,
     time_limit: float | None = None,
     tolerance: float = 1e-6,
-    memory: str | None = None,
-    start: PolicyTable | None = None,
-    on_progress: Callable[[SearchProgress], None] | None = None,
+    **of_bound: Any,
 ) -> Solution:
     """The best policy found for keys of the world's memory; Ctrl-C ends the search with what it has found.
 
     Args:
         world: with hidden modes.
-        nodes: of the bound's proof.
-        time_limit: seconds after which the search ends with the best policy so far, and as many for the bound's proof.
-        tolerance: bracket that counts as closed, relative to the value.
-        memory: of the bound's proof, as in `optimal.solve`.
         start: a deterministic policy of the same keys that the one found is no worse than.
         on_progress: called after each policy that is searched.
+        time_limit: seconds after which the search ends with the best policy so far, and as many for the bound's proof.
+        tolerance: bracket that counts as closed, relative to the value.
+        **of_bound: further options of the bound's proof, by `optimal.solve`.
     """
     began = time.monotonic()
-    best = optimal.solve(
-        revealing(world),
-        nodes=nodes,
-        time_limit=time_limit,
-        tolerance=tolerance,
-        memory=memory,
-    )
-    budget, interrupted = Budget(nodes, time_limit), best.interrupted
+    both: Any = {"time_limit": time_limit, "tolerance": tolerance}
+    best = optimal.solve(revealing(world), **both, **of_bound)
+    budget, interrupted = Budget(1, time_limit), best.interrupted  # no node is counted here
     search = Search(world, WHOLE, _watching(on_progress, budget, best, began))
     try:
         if not interrupted:
@@ -116,7 +109,7 @@ def solve(
 
 
 def _watching(
-    on_progress: Callable[[SearchProgress], None] | None,
+    on_progress: OnProgress,
     budget: Budget,
     best: Solution,
     began: float,

@@ -35,7 +35,7 @@ from trackmdp.solvers.regions import improved, proved, region_side, settled, wid
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.rules import clocked_policy
 from trackmdp.solvers.search import Found, clocked_sets, follow_credit
-from trackmdp.solvers.solution import SearchProgress, Solution, unit
+from trackmdp.solvers.solution import OnProgress, SearchProgress, Solution, unit
 from trackmdp.solvers.value import value_of
 from trackmdp.world.model import World
 
@@ -66,7 +66,7 @@ def solve(
     tolerance: float = 1e-6,
     memory: str | None = None,
     start: PolicyTable | None = None,
-    on_progress: Callable[[SearchProgress], None] | None = None,
+    on_progress: OnProgress = None,
 ) -> Solution:
     """Search until the bracket is closed to `tolerance` of the value, or `nodes` are looked at.
 
@@ -115,7 +115,7 @@ class _Run:
     budget: Budget
     tolerance: float
     start: PolicyTable | None
-    on_progress: Callable[[SearchProgress], None] | None
+    on_progress: OnProgress
     side: int | None
     restarted: bool = False
     other: PolicyTable | None = None

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -115,6 +116,10 @@ class SearchProgress:
         bracket = f"bracket {self.lower:,.4f} ... {self.upper:,.4f}"
         line = f"{self.seconds:.0f} s  {bracket}  {self.nodes:,} nodes"
         return line if self.left is None else f"{line}  {self.stage}, {self.left:.0f} s left"
+
+
+OnProgress: TypeAlias = Callable[[SearchProgress], None] | None
+"""Called with the progress of a search; None: nobody looks."""
 
 
 def unit(world: World, value: float) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable
 from functools import partial
 from inspect import signature
 from typing import TYPE_CHECKING, Any, overload
@@ -19,7 +18,7 @@ from trackmdp.solvers.partition import blocks, narrow_halo, plan_by_blocks
 from trackmdp.solvers.regions import settled
 from trackmdp.solvers.several.group_bounds import upper_bound
 from trackmdp.solvers.several.group_solution import GroupSolution
-from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
+from trackmdp.solvers.solution import OnProgress, Solution, bracketed
 from trackmdp.solvers.workers import Crew, crew
 from trackmdp.world.group import Group, check_problem
 from trackmdp.world.model import World
@@ -44,7 +43,7 @@ def solve(
     *,
     nodes: int = default("solver.nodes", "solve"),
     time_limit: float | None = default("solver.time_limit", "solve"),
-    on_progress: Callable[[SearchProgress], None] | None = None,
+    on_progress: OnProgress = None,
     block: int | None = default("partition.block", "solve"),
     halo: int | None = default("partition.halo", "solve"),
     workers: int = default("partition.workers", "solve"),
@@ -100,7 +99,7 @@ def solve(
 def run_solver(
     world: World,
     choice: BaselineConfig,
-    on_progress: Callable[[SearchProgress], None] | None = None,
+    on_progress: OnProgress = None,
     partition: SweptPartitionConfig | None = None,
     start: PolicyTable | None = None,
 ) -> Solution:
@@ -142,7 +141,7 @@ def _closes(world: World, choice: BaselineConfig, partition: SweptPartitionConfi
 def solve_group(
     group: Group,
     choice: BaselineConfig,
-    on_progress: Callable[[SearchProgress], None] | None = None,
+    on_progress: OnProgress = None,
     partition: SweptPartitionConfig | None = None,
 ) -> GroupSolution:
     """Plans of single targets by a config's solver, and the bound for all of them together."""
@@ -156,7 +155,7 @@ def _modes(
     world: World,
     choice: BaselineConfig,
     start: PolicyTable | None,
-    on_progress: Callable[[SearchProgress], None] | None,
+    on_progress: OnProgress,
 ) -> Solution:
     """As `run_solver`, where modes are hidden, or the solver does not read them."""
     from trackmdp.solvers import hidden

@@ -7,7 +7,7 @@ import json
 import math
 import platform
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -30,7 +30,7 @@ from trackmdp.policies.saved import load_policy
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import group_rule
 from trackmdp.solvers.evaluation import Evaluation, figures
-from trackmdp.solvers.several.group_tracker import GroupTracker
+from trackmdp.solvers.several.group_tracker import Followed
 from trackmdp.solvers.several.merging import Rule
 from trackmdp.solvers.solution import Solution
 from trackmdp.training import checkpoint
@@ -50,7 +50,7 @@ Metrics = dict[str, list[float | int | None]]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Run(Carded):
+class Run(Followed, Carded):
     """A training run that has ended.
 
     Attributes:
@@ -100,19 +100,6 @@ class Run(Carded):
         if self.folder is not None and (cfg := load_run_config(self.folder)).targets.count > 1:
             return group_rule(group_of(problem_of(cfg, self.folder), cfg.targets.count), self)
         raise UserError("tracker: a run of one target, expected run.policy.tracker(cell)")
-
-    def tracker(
-        self,
-        cells: Sequence[int] | None = None,
-        *,
-        at: Sequence[tuple[float, float]] | None = None,
-    ) -> GroupTracker:
-        """A tracker that follows the run's several targets, located in `cells` or `at` positions, with `rule`.
-
-        Raises:
-            UserError: the run is of one target; or as of `GroupTracker`.
-        """
-        return GroupTracker(self.rule, cells, at=at)
 
     def card(self) -> Card:
         """Algorithm, budget, figures, bound and folder."""

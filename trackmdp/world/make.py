@@ -18,7 +18,7 @@ from trackmdp.config.several import MOST_TARGETS
 from trackmdp.errors import UserError
 from trackmdp.grid.size import Size, grid_size
 from trackmdp.recordings.tracks import Recorded
-from trackmdp.world.configured import build_world, make_problem
+from trackmdp.world.configured import make_problem
 from trackmdp.world.group import Group
 from trackmdp.world.model import World
 from trackmdp.world.problem import modelled
@@ -129,11 +129,8 @@ def make_world(
         )
     words = given({"kernel": kernel}) | _words(arguments)
     targets = whole_number("targets", targets, 1, MOST_TARGETS)
-    # `compare` has all options of a world, and no solver or learner that could refuse one of them.
-    if targets == 1:
-        return modelled(make_problem(compose("compare", words)), f"kernel={kernel}")
-    cfg = compose("solve", words | {"targets.count": targets})
-    return Group([build_world(cfg)] * targets)
+    world = modelled(make_problem(_config(words, targets)), f"kernel={kernel}")
+    return world if targets == 1 else Group([world] * targets)
 
 
 @overload
@@ -186,11 +183,18 @@ def load_tracks(
     if isinstance(named := options.get("columns"), Mapping):
         options["columns"] = [f"{ours}:{theirs}" for ours, theirs in named.items()]
     words = {"kernel": "tracks", "kernel.path": source} | _words({"size": size, **options})
-    # `compare` has no option of several targets; `evaluate` takes them, and with a budget too where no sensor is on.
-    of_several = {} if targets == 1 else {"targets.count": targets, "baseline": "none"}
-    cfg = compose("evaluate" if of_several else "compare", words | of_several)
-    made = cast(Recorded, make_problem(cfg, frame=path if in_memory else None))
+    frame = path if in_memory else None
+    made = cast(Recorded, make_problem(_config(words, targets), frame=frame))
     return made if targets == 1 else Group.of_tracks(made, targets)
+
+
+def _config(words: dict[str, Any], targets: int) -> Any:
+    """The checked config of a problem."""
+    # `compare` has all options of a world, and no solver or learner that could refuse one of them; `evaluate` takes
+    # several targets, and with a budget too where no sensor is on.
+    if targets == 1:
+        return compose("compare", words)
+    return compose("evaluate", words | {"targets.count": targets, "baseline": "none"})
 
 
 def _words(arguments: dict[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,6 @@ from rich.console import Console
 from trackmdp.app.commands.frontier import mixture_report, show_mixture, write_corners
 from trackmdp.config import SolveConfig
 from trackmdp.durable import write_json
-from trackmdp.errors import UserError
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluation import figures, regret_per_step
@@ -37,10 +36,6 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem) -> float:
     Ctrl-C ends a search early: the bracket reached so far is printed and saved.
     """
     console = make_console(cfg.quiet)
-    if cfg.grid.max_steps is not None:
-        raise UserError(
-            f"grid.max_steps={cfg.grid.max_steps}: only whole episodes are solved, expected null"
-        )
     world = modelled(problem, "solve")
     if cfg.verify:
         check_sensors(world)

@@ -10,7 +10,7 @@ from rich.table import Column, Table
 
 from trackmdp.config import VerifyConfig
 from trackmdp.durable import write_json
-from trackmdp.errors import RunError, UserError
+from trackmdp.errors import RunError
 from trackmdp.paper import theorems
 from trackmdp.paper.check import summarize_checks
 from trackmdp.solvers import hidden, optimal
@@ -29,10 +29,6 @@ def run(cfg: VerifyConfig, folder: Path, world: Problem) -> None:
         RunError: a claim fails.
     """
     console = make_console(cfg.quiet)
-    if cfg.grid.max_steps is not None:
-        raise UserError(
-            f"grid.max_steps={cfg.grid.max_steps}: theorems are on whole episodes, expected null"
-        )
     known = modelled(world, "verify")
     check_sensors(known)
     verify_world(known, cfg.tolerance, folder, console)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 from trackmdp.notebook.card import Card, Carded, decimal, grid_words
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.several.group_bounds import sensors_suffice
-from trackmdp.solvers.several.group_tracker import GroupTracker
+from trackmdp.solvers.several.group_tracker import Followed
 from trackmdp.solvers.several.merging import Rule, make_rule
 from trackmdp.solvers.solution import Solution
 from trackmdp.solvers.value import price_at_exit
@@ -17,7 +16,7 @@ from trackmdp.world.group import Group
 
 
 @dataclass(frozen=True, repr=False)
-class GroupSolution(Carded):
+class GroupSolution(Followed, Carded):
     """Plans for several targets.
 
     Attributes:
@@ -42,14 +41,10 @@ class GroupSolution(Carded):
         """The policy that adds up the gains of all targets; with hidden modes the union of their sets."""
         return make_rule(self.group, self.tables)
 
-    def tracker(
-        self,
-        cells: Sequence[int] | None = None,
-        *,
-        at: Sequence[tuple[float, float]] | None = None,
-    ) -> GroupTracker:
-        """A tracker that follows targets located in `cells` or `at` positions, with `policy`."""
-        return GroupTracker(self.policy, cells, at=at)
+    @property
+    def rule(self) -> Rule:
+        """See `Followed`; `policy`."""
+        return self.policy
 
     @property
     def apart(self) -> float:

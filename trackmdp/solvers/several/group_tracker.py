@@ -210,6 +210,24 @@ class GroupTracker(Following):
         return tracker
 
 
+class Followed:
+    """Holds a policy for several targets, its `rule`, by which they can be followed."""
+
+    @property
+    def rule(self) -> Rule:
+        """The policy."""
+        raise NotImplementedError
+
+    def tracker(
+        self,
+        cells: Sequence[int] | None = None,
+        *,
+        at: Sequence[tuple[float, float]] | None = None,
+    ) -> GroupTracker:
+        """A tracker that follows the targets, located in `cells` or `at` positions, with `rule`; see `GroupTracker`."""
+        return GroupTracker(self.rule, cells, at=at)
+
+
 def _each(given: Any, call: str, count: int | None = None) -> list[Any]:
     """The items of a sequence.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +22,12 @@ from trackmdp.policies.forms import DrawsError, check_reads, mode_of, state_keys
 from trackmdp.seeding import preserved_global_rng
 from trackmdp.sensing.actions import checked_action
 from trackmdp.solvers.several.beliefs import Beliefs, Clocks
-from trackmdp.solvers.several.group_tracker import GroupTracker
+from trackmdp.solvers.several.group_tracker import Followed
 from trackmdp.solvers.several.merging import Rule
 from trackmdp.world.group import Group
 
 
-class JointRule(Rule):
+class JointRule(Followed, Rule):
     """The most likely sets of an actor over the observations that `TrackEnv` shows of a group.
 
     Args:
@@ -123,14 +122,10 @@ class JointRule(Rule):
         found = checked_action(action, shape, "policy: its action", self.task.budget)
         return found.cpu().numpy() & self.task.available
 
-    def tracker(
-        self,
-        cells: Sequence[int] | None = None,
-        *,
-        at: Sequence[tuple[float, float]] | None = None,
-    ) -> GroupTracker:
-        """A tracker that follows targets located in `cells` or `at` positions."""
-        return GroupTracker(self, cells, at=at)
+    @property
+    def rule(self) -> JointRule:
+        """See `Followed`."""
+        return self
 
     def packed(self) -> list[dict[str, Any]]:
         """The weights by their names, in single precision as they were learned, and the kind of each target."""
