@@ -302,10 +302,19 @@ def references(evaluator: Evaluator, solution: Solution | None) -> dict[str, Any
     return {name: figures(each) for name, each in found.items()}
 
 
-def trained(run: str, device: torch.device, *, best: bool = False) -> tuple[Subject, Any, str]:
+def trained(
+    run: str, device: torch.device, *, best: bool = False, targets: int | None = None
+) -> tuple[Subject, Any, str]:
     """Where a run learned, the policy of its newest checkpoint, or of the best one, and its name.
 
     A run by blocks has no checkpoint: the policy is the one in `policy.npz`.
+
+    Args:
+        run: its folder.
+        device: of networks.
+        best: take the best checkpoint.
+        targets: of at least so many, and as many as the run has, the plans are merged, as it asks for; None: they are
+            returned as they were learned.
 
     Raises:
         UserError: that is no run, or the checkpoint is missing, damaged or another run's.
@@ -317,10 +326,15 @@ def trained(run: str, device: torch.device, *, best: bool = False) -> tuple[Subj
             raise UserError(
                 f"checkpoint=best: expected newest for run={run}, whose blocks have checkpoints of their own"
             )
-        return world, load_run(folder).policy, f"{cfg.algo.name}, by blocks"
-    own = with_own_classes(cfg, folder)
-    algorithm = make_algorithm(own, world.task, device, targets=world.targets)
-    file = folder / "checkpoints" / checkpoint.BEST if best else checkpoint.newest(folder)
-    load_learned(algorithm, cfg, world, file, device)
-    policy = learned_policy(world, algorithm.actor, device)
-    return world, policy, f"{cfg.algo.name}, {file.name}"
+        policy: Any = load_run(folder).policy
+        source = "by blocks"
+    else:
+        own = with_own_classes(cfg, folder)
+        algorithm = make_algorithm(own, world.task, device, targets=world.targets)
+        file = folder / "checkpoints" / checkpoint.BEST if best else checkpoint.newest(folder)
+        load_learned(algorithm, cfg, world, file, device)
+        policy, source = learned_policy(world, algorithm.actor, device), file.name
+    if targets is not None and (count := max(targets, cfg.targets.count)) > 1:
+        world = group_of(world, count)
+        policy = group_rule(world, policy, cfg.targets.merge)
+    return world, policy, f"{cfg.algo.name}, {source}"

@@ -11,11 +11,10 @@ import torch
 
 from trackmdp.config import CompareConfig, load_run_config
 from trackmdp.durable import write_json
-from trackmdp.solvers.evaluate import group_rule
 from trackmdp.training.compare import Comparison, compare
 from trackmdp.training.display import make_console, table
 from trackmdp.training.run import trained
-from trackmdp.world.group import Group, Subject, group_of
+from trackmdp.world.group import Group, Subject
 from trackmdp.world.problem_file import problem_digest
 
 
@@ -28,16 +27,8 @@ def run(cfg: CompareConfig, folder: Path, problem: Subject) -> None:
     torch.set_num_threads(1)  # as in `evaluate`: networks of few rows wait long for more
     console, policies = make_console(cfg.quiet), dict[str, Any]()
     runs, baselines = cfg.runs or [], cfg.baselines or []
-    found = [trained(each, torch.device("cpu")) for each in runs]
-    several = [load_run_config(each).targets for each in runs]
-    count = max((each.count for each in several), default=1)
-    if count > 1:
-        # As it was learned: without a word of its own `compare` merges by its default.
-        found = [
-            (group, group_rule(group, policy, each.merge) if each.merge else policy, name)
-            for each, (own, policy, name) in zip(several, found, strict=True)
-            for group in [group_of(own, count)]
-        ]
+    count = max((load_run_config(each).targets.count for each in runs), default=1)
+    found = [trained(each, torch.device("cpu"), targets=count) for each in runs]
     if found:
         problem = found[0][0]
     # A run's folder may have the name of another's, or of a baseline; then its whole path is shown.

@@ -45,7 +45,7 @@ from trackmdp.training.display import FIGURES, make_console, show_held_out, tabl
 from trackmdp.training.evaluator import CELL_ALONE, ExactEvaluator, HeldOutEvaluator
 from trackmdp.training.folders import SUMMARY, check_files, read_summary
 from trackmdp.training.run import trained
-from trackmdp.world.group import Group, Subject, group_of, one_target
+from trackmdp.world.group import Group, Subject, group_of
 from trackmdp.world.model import World
 from trackmdp.world.problem import Problem
 
@@ -63,16 +63,16 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem) -> float:
     believed = isinstance(cfg.sensor, FalseAlarmConfig)
     world: Subject
     if cfg.run:
-        world, policy, subject = trained(cfg.run, device)
+        world, policy, subject = trained(cfg.run, device, targets=cfg.targets.count)
     elif isinstance(cfg.baseline, PlaybackConfig) and not believed:
         return evaluate_playback(cfg, cfg.baseline, problem, folder, console)
     else:
         assert cfg.baseline is not None
         world, policy, subject = problem, baseline_policy(problem, cfg.baseline), cfg.baseline.name
-    count = max(cfg.targets.count, load_run_config(cfg.run).targets.count if cfg.run else 1)
-    if count > 1:
-        return _several(cfg, group_of(world, count), policy, subject, folder, console)
-    world = one_target(world, f"run={cfg.run}")
+        if cfg.targets.count > 1:
+            world = group_of(problem, cfg.targets.count)
+    if isinstance(world, Group):
+        return _several(cfg, world, policy, subject, folder, console)
     if believed:
         return evaluate_believed(cfg, world, policy, subject, folder, console)
     # Recorded tracks have no kernel, hence no exact value and no bound: figures come from the held-out tracks.
@@ -127,15 +127,14 @@ def _several(
     cfg: EvaluateConfig, group: Group, policy: Any, subject: str, folder: Path, at: Console
 ) -> float:
     """Evaluate for several targets: `evaluation.json`; returns the AIHTR."""
-    learned = load_run_config(cfg.run).targets.merge if cfg.run else None
-    rule = group_rule(group, policy, cfg.targets.merge or learned)
+    rule = group_rule(group, policy, cfg.targets.merge)
     with at.status("simulating all targets"):
         found = evaluate_group(rule, width=cfg.evaluation.width, seed=cfg.seed)
     apart, recorded, upper = None, group.recorded, upper_bound(group)
     if rule.tables:  # else it was learned for all targets together
         # On recorded tracks each is in one of the groups, some of which have fewer targets.
         each = len(group) if recorded is None else len(recorded.held_out) / len(found.totals)
-        apart = each * evaluate(group.single, policy).aihtr
+        apart = each * evaluate(group.single, rule.tables[0]).aihtr
     report = {"policy": subject, "targets": len(group), "merge": rule.name, **found.report()}
     write_json(folder / "evaluation.json", report | {"apart": apart, "upper": upper})
     rows = [
