@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -169,7 +169,7 @@ class _ZeroedStorage(LazyTensorStorage):
 class DQN(Checkpointed):
     """Learns off policy from a replay buffer; explores by flipping sensors; the target network is evaluated."""
 
-    parts: ClassVar[tuple[str, ...]] = (
+    parts = (
         "loss",
         "optimizer",
         "buffer",

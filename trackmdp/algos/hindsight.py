@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -83,7 +83,7 @@ class Hindsight(Checkpointed):
     output for where it is.
     """
 
-    parts: ClassVar[tuple[str, ...]] = (
+    parts = (
         "_seed",
         "_iteration",
         "_update",
@@ -289,7 +289,7 @@ def _within(cells: Tensor, reach: int, task: Task) -> Tensor:
 class _Learner(Checkpointed):
     """The nets, their optimizer, and the exponential moving average of the actor, which is replayed and evaluated."""
 
-    parts: ClassVar[tuple[str, ...]] = ("reach", "loss", "ema", "optimizer", "count")
+    parts = ("reach", "loss", "ema", "optimizer", "count")
 
     def __init__(self, loss: HindsightLoss, ema_decay: float) -> None:
         self.loss, self.reach, self._decay, self.count = loss, loss.reach, ema_decay, 0

@@ -144,6 +144,6 @@ def _lists(
     """`[*shape, D]`, at `place` the `names` of the columns of each row of `matrix`, filled up with `none`; its data."""
     columns, numbers = padded_rows(matrix, len(names))
     table = np.full((*shape, columns.shape[1]), none)
-    data = np.zeros(table.shape, dtype=np.float32)
+    data = np.zeros(table.shape, np.float32)
     table[place], data[place] = np.append(names, none)[columns], numbers
     return table, data

@@ -106,7 +106,7 @@ class _Paths:
         """The policy of the plans that exchange finds."""
         plans = self.plans(value)
         sets = plans.ascend(self.sets(policy), sweeps=2)
-        found = exchange(plans, sets, np.ones(self._count, dtype=bool))
+        found = exchange(plans, sets, np.ones(self._count, bool))
         return PolicyTable.from_sensed(
             self._task, sensed((turn.choice for turn in self._turns), found, self._keys)
         )

@@ -10,7 +10,7 @@ Thompson 1933), which costs far less and leaves moves to be inferred from misses
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -75,7 +75,7 @@ class ModelBased(Checkpointed):
         device: where the policies' tables live; the estimates are on the CPU.
     """
 
-    parts: ClassVar[tuple[str, ...]] = (
+    parts = (
         "_iteration",
         "_frames",
         "_sensors",

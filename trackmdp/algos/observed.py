@@ -134,8 +134,8 @@ class SensedPaths:
         self._task, self._capacity, self._seed = task, capacity, seed
         self._parts: list[_Sensed] = []
         # [B], safe actions of each row's unfinished path.
-        self._waiting: IndexArray = np.zeros(0, dtype=np.int64)
-        self._running = np.zeros(0, dtype=np.int64)  # [B], number of the episode of each row
+        self._waiting: IndexArray = np.zeros(0, np.int64)
+        self._running = np.zeros(0, np.int64)  # [B], number of the episode of each row
         self._next = 0
         self._tracks: Tracks | None = None
 
@@ -213,7 +213,7 @@ class SensedPaths:
         # Else nothing is known of where the target went.
         known = ((paths.waits >= 0) & (paths.waits <= _LONGEST_WAIT))[order]
         paths = paths.pick(order[known]).waiting()
-        begins = np.ones(len(paths.start), dtype=bool)
+        begins = np.ones(len(paths.start), bool)
         begins[1:] = (np.diff(paths.episode) != 0) | (paths.end[:-1] != paths.start[1:])
         # A path adds its hidden cells and its end, the first one of a track its start as well.
         first = ends_of((paths.misses + 1 + begins).astype(np.int64))
@@ -225,7 +225,7 @@ class SensedPaths:
         if not seen.all():
             line = self._filled(paths, line, ends_of(np.bincount(track)))
         inside = line < cells
-        exits = np.zeros(int(begins.sum()), dtype=bool)
+        exits = np.zeros(int(begins.sum()), bool)
         exits[track[~inside]] = True
         ends = ends_of(np.bincount(track[inside], minlength=len(exits)))
         line, seen = line[inside], seen[inside]
@@ -244,7 +244,7 @@ class SensedPaths:
         if task.markov:
             return line
         count = len(first) - 1
-        tracks = Tracks(line, first, np.ones(count, dtype=bool), np.arange(count))
+        tracks = Tracks(line, first, np.ones(count, bool), np.arange(count))
         return redrawn(task, tracks, unknown, _missed(paths), rng)
 
     def state_dict(self) -> dict[str, Any]:
@@ -286,7 +286,7 @@ def _goes_on(tracks: Tracks) -> BoolArray:
     pieces = tracks.pieces()
     # In order: a path comes right before one that goes on as it.
     begun = {some for some, more in pairwise(sorted(set(pieces))) if more.startswith(some)}
-    return ~tracks.exits & np.array([piece in begun for piece in pieces], dtype=np.bool_)
+    return ~tracks.exits & np.array([piece in begun for piece in pieces], np.bool_)
 
 
 def _recordings(line: Array, seen: BoolArray, first: IndexArray) -> IndexArray:

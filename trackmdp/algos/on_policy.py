@@ -192,7 +192,7 @@ class PPO(OnPolicy):
     """
 
     cfg: PpoConfig
-    parts: ClassVar[tuple[str, ...]] = (*OnPolicy.parts, "generator")
+    parts = (*OnPolicy.parts, "generator")
     diagnostics: ClassVar = OnPolicy.diagnostics | {
         "approx_kl": "kl_approx",
         "clip_fraction": "clip_fraction",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from trackmdp.cluster import ADDRESS
-from trackmdp.config.options import NodeConfig, count_option, listed, option, refuse
+from trackmdp.config.options import NodeConfig, Reasons, count_option, listed, option, refuse
 
 
 class PartitionConfig(NodeConfig):
@@ -45,7 +45,7 @@ class PartitionConfig(NodeConfig):
         if root.init_from is not None:
             raise refuse("init_from", root.init_from, f"null with {key}.block")
 
-    def ignored(self, root: Any) -> dict[str, str]:
+    def ignored(self, root: Any) -> Reasons:
         """Without blocks there is nothing to know of, or to share out."""
         why = f"without partition.block, the whole grid being {'learned' if root.learns else 'planned'} at once"
         return {name: why for name in vars(self) if name != "block"} if self.block is None else {}

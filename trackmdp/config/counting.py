@@ -8,6 +8,8 @@ from trackmdp.config.learning import EveryTaskConfig, renewed_table
 from trackmdp.config.options import (
     BYTES,
     TABLE,
+    Needs,
+    Reasons,
     choice,
     count_option,
     file_option,
@@ -77,7 +79,7 @@ class ModelBasedConfig(EveryTaskConfig):
                 f"{key}.share_cells", self.share_cells, "none or null with kernel.reveals=true"
             )
 
-    def ignored(self, root: Any) -> dict[str, str]:
+    def ignored(self, root: Any) -> Reasons:
         """All sensors are on before chosen sets, if a budget allows it; moves have no prior of keys."""
         found, limited = {}, root.cost.budget is not None
         if limited or self.sensing != "chosen":
@@ -87,7 +89,7 @@ class ModelBasedConfig(EveryTaskConfig):
             found |= dict.fromkeys(("prior", "gamma"), "with algo.estimate=moves")
         return found
 
-    def needs(self, task: Any, root: Any) -> dict[str, int]:
+    def needs(self, task: Any, root: Any) -> Needs:
         """The paths, and the gains of each detection that may be on them; the table of chosen sets."""
         found = {"grid.size": renewed_table(task)} if self.chooses(root.cost.budget) else {}
         if task.markov or self.estimate == "moves":

@@ -15,6 +15,8 @@ from trackmdp.config.learning import (
 from trackmdp.config.options import (
     BYTES,
     TABLE,
+    Needs,
+    Reasons,
     choice,
     count_option,
     file_option,
@@ -86,11 +88,11 @@ class PerSensorConfig(EveryTaskConfig):
             if (share := getattr(self.explore, end)) > 1:
                 raise refuse(f"{key}.explore.{end}", share, "a number from 0 to 1, a probability")
 
-    def ignored(self, root: Any) -> dict[str, str]:
+    def ignored(self, root: Any) -> Reasons:
         """All sensors on leave nothing to explore."""
         return {} if self.collect == "mixed" else {"explore": "with algo.collect=all_on"}
 
-    def needs(self, task: Any, root: Any) -> dict[str, int]:
+    def needs(self, task: Any, root: Any) -> Needs:
         """The moves kept, and their sorting; the paths of one update; the networks; the table that explores.
 
         A move is two cells of 16 bits. Where moves of different paths do not combine (`markov`), a third number

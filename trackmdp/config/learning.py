@@ -8,7 +8,9 @@ from trackmdp.cluster import ADDRESS
 from trackmdp.config.options import (
     BYTES,
     ChoiceConfig,
+    Needs,
     NodeConfig,
+    Reasons,
     choice,
     count_option,
     nested,
@@ -97,7 +99,7 @@ class NetworkConfig(EveryTaskConfig):
     hidden: int = count_option("units of the hidden layer of each network", unit="units", le=4096)
     reward_scale: float = option("factor on rewards while learning, in units of cost.reward", gt=0)
 
-    def needs(self, task: Any, root: Any) -> dict[str, int]:
+    def needs(self, task: Any, root: Any) -> Needs:
         """Two networks and their optimiser; their hidden units for each target of a batch."""
         found, targets = {"algo.hidden": networks(task, self.hidden)}, together(root)
         if targets > 1:
@@ -148,7 +150,7 @@ class PrioritizedConfig(NodeConfig):
     alpha: float = share_option("how much priorities matter")
     beta: float = share_option("how much the draw is corrected for")
 
-    def ignored(self, root: Any) -> dict[str, str]:
+    def ignored(self, root: Any) -> Reasons:
         """Uniform replay has no priorities."""
         return (
             {}
@@ -179,7 +181,7 @@ class DqnConfig(NetworkConfig):
             expected = f"at least collector.frames_per_batch={frames} and {key}.batch_size={self.batch_size}"
             raise refuse(f"{key}.buffer_size", self.buffer_size, expected)
 
-    def needs(self, task: Any, root: Any) -> dict[str, int]:
+    def needs(self, task: Any, root: Any) -> Needs:
         """The replay buffer with two states a transition; the networks."""
         # State and next state, the action's K bits as bools, two float32 and one flag (reward, discount,
         # terminated), an index.
@@ -229,7 +231,7 @@ class CollectorConfig(ChoiceConfig):
             expected = f"at least {batch}={self.frames_per_batch}"
             raise refuse(frames, self.total_frames, expected)
 
-    def needs(self, task: Any, root: Any) -> dict[str, int]:
+    def needs(self, task: Any, root: Any) -> Needs:
         """Two batches: one is collected while the other is handed over."""
         number = BYTES["float32"]
         state = state_bytes(task, root)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from trackmdp.config.options import ChoiceConfig, choice, count_option, option
+from trackmdp.config.options import ChoiceConfig, Reasons, choice, count_option, option
 from trackmdp.errors import require
 
 
@@ -74,7 +74,7 @@ class McapConfig(LogConfig):
     )
     layout: bool = option("write a viewer's layout next to the log")
 
-    def ignored(self, root: Any) -> dict[str, str]:
+    def ignored(self, root: Any) -> Reasons:
         """An evaluation logs all the episodes that it simulates."""
         return {} if root.learns else dict.fromkeys(("evaluations", "episodes"), "outside training")
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import Field, dataclass
 from functools import cache
 from math import inf
-from typing import Any, ClassVar, TypeVar, dataclass_transform
+from typing import Any, ClassVar, TypeAlias, TypeVar, dataclass_transform
 
 from trackmdp.errors import UserError
 
@@ -205,6 +205,12 @@ BYTES = {"float32": 4, "int64": 8, "float64": 8, "int16": 2, "bool": 1}
 """Bytes of one number of each kind, for `needs`."""
 
 
+Reasons: TypeAlias = dict[str, str]
+"""Option without effect -> the reason."""
+Needs: TypeAlias = dict[str, int]
+"""Option -> bytes that grow with it."""
+
+
 @dataclass_transform(
     kw_only_default=True,
     field_specifiers=(option, share_option, count_option, file_option, nested),
@@ -231,14 +237,14 @@ class NodeConfig:
             UserError: a rule is broken.
         """
 
-    def ignored(self, root: Any) -> dict[str, str]:
+    def ignored(self, root: Any) -> Reasons:
         """Options of this node without effect on this config, and the reason: ``{"alpha": "with ...enabled=false"}``.
 
         They are refused if typed (`trackmdp.config.checks`).
         """
         return {}
 
-    def needs(self, task: Any, root: Any) -> dict[str, int]:
+    def needs(self, task: Any, root: Any) -> Needs:
         """Bytes that a run needs for this node, by the dotted option that they grow with.
 
         Args:

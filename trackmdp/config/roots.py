@@ -12,6 +12,7 @@ from trackmdp.config.logs import LogConfig
 from trackmdp.config.options import (
     GROUPS,
     NodeConfig,
+    Reasons,
     count_option,
     file_option,
     listed,
@@ -155,7 +156,7 @@ class EvaluateConfig(ComputingConfig):
         if self.log and not self.episodes:
             raise refuse("episodes", 0, f"at least 1 with log={listed(self.log)}")
 
-    def ignored(self, root: Any) -> dict[str, str]:
+    def ignored(self, root: Any) -> Reasons:
         """Of several targets as many episodes are simulated as `evaluation.width` asks for, and logged as are named."""
         why = f"with targets.count={self.targets.count} and no log, where evaluation.width is met"
         return {"episodes": why} if self.targets.count > 1 and not self.log else {}
@@ -261,7 +262,7 @@ class ReplayConfig(CommandConfig):
     layout: str | None = file_option("write the layout for viewers", "a file to write")
     speed: float = option("speed of playing", unit="steps/s", gt=0, le=1000)
 
-    def ignored(self, root: Any) -> dict[str, str]:
+    def ignored(self, root: Any) -> Reasons:
         """An episode is played where nothing else is asked for; layout and recover are of the whole log."""
         of_one, of_all = (self.html, self.csv, self.verify), (self.layout, self.recover)
         unread = {"speed": "where no episode is played, which episode=N alone does"}
@@ -288,7 +289,7 @@ class ReportConfig(CommandConfig):
         "seconds from one look at the runs to the next, with watch=true", unit="s", gt=0, le=3600
     )
 
-    def ignored(self, root: Any) -> dict[str, str]:
+    def ignored(self, root: Any) -> Reasons:
         """A watch looks again and again, and makes no report."""
         names = ("paper", "threshold") if self.watch else ("every",)
         return dict.fromkeys(names, f"with watch={str(self.watch).lower()}")

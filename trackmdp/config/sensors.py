@@ -9,6 +9,7 @@ from trackmdp.config.options import (
     TABLE,
     ChoiceConfig,
     Option,
+    Reasons,
     choice,
     count_option,
     file_option,
@@ -85,7 +86,7 @@ class PaperCostConfig(CostConfig):
             f"{key}.sensor", self.sensor, count, price, "number from 0 to 1e15", each, some=True
         )
 
-    def ignored(self, root: Any) -> dict[str, str]:
+    def ignored(self, root: Any) -> Reasons:
         """One price for all sensors, where the command goes through all prices and D is given."""
         one = isinstance(self.sensor, (int, float))
         if root.all_prices and one and self.safe is not None:
@@ -203,7 +204,7 @@ class FootprintConfig(MissConfig):
         super().check(key, root)
         self._check_solver(key, root)
 
-    def ignored(self, root: Any) -> dict[str, str]:
+    def ignored(self, root: Any) -> Reasons:
         """A file holds the footprints themselves."""
         why = f"with sensor.path={self.path}"
         return {} if self.path is None else {"radius": why, "spacing": why}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from trackmdp.config.options import NodeConfig, count_option, option, refuse
+from trackmdp.config.options import NodeConfig, Reasons, count_option, option, refuse
 
 MOST_TARGETS = 1_000
 """Targets in one grid: of more, each step and each bound would take minutes."""
@@ -61,7 +61,7 @@ class MergedTargetsConfig(TargetsConfig):
         choices=("gains", "union"),
     )
 
-    def ignored(self, root: Any) -> dict[str, str]:
+    def ignored(self, root: Any) -> Reasons:
         """One target needs no merging, and no more does a policy that was learned for all."""
         algo: Any = getattr(root, "algo", None)
         if algo is not None and algo.joint:
@@ -79,7 +79,7 @@ class WidthConfig(NodeConfig):
         gt=0,
     )
 
-    def ignored(self, root: Any) -> dict[str, str]:
+    def ignored(self, root: Any) -> Reasons:
         """Figures of one target are exact."""
         known = getattr(root, "run", None) is None
         return {"width": "with targets.count=1"} if known and root.targets.count == 1 else {}

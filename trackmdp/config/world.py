@@ -6,7 +6,9 @@ from typing import Any
 
 from trackmdp.config.options import (
     ChoiceConfig,
+    Needs,
     NodeConfig,
+    Reasons,
     choice,
     count_option,
     file_option,
@@ -78,7 +80,7 @@ class GridConfig(NodeConfig):
                 if getattr(self, name) is not None and getattr(self, needed) is None:
                     raise UserError(f"{key}.{needed}: missing, expected beside {key}.{name}")
 
-    def ignored(self, root: Any) -> dict[str, str]:
+    def ignored(self, root: Any) -> Reasons:
         """The side of a cell, of a grid without a place whose motion is not in metres."""
         metres = not root.kernel.is_motion or hasattr(root.kernel, "cell")
         return {} if metres or self.origin else {"cell": "without grid.origin"}
@@ -120,14 +122,14 @@ class TaskConfig(NodeConfig):
         if self.memory != "cell":
             require_able(root, "remembers", f"with {key}.memory={self.memory}")
 
-    def needs(self, task: Any, root: Any) -> dict[str, int]:
+    def needs(self, task: Any, root: Any) -> Needs:
         """A set for every key and n, and its search."""
         if self.memory == "cell":
             return {}
         # Some six sensors a set, each 60 bytes while plans are put together, and a row pointer or two.
         return {"task.memory": task.num_keys * (task.t_max + 1) * 400}
 
-    def ignored(self, root: Any) -> dict[str, str]:
+    def ignored(self, root: Any) -> Reasons:
         """A memory of the cell alone has no displacement."""
         return {"clip": "with task.memory=cell"} if self.memory == "cell" else {}
 
@@ -175,7 +177,7 @@ class RandomSupportConfig(ExitingConfig):
             expected = f"less than 1 - {key}.exit_probability = {1 - self.exit_probability:g}"
             raise refuse(f"{key}.low_probability", self.low_probability, expected)
 
-    def ignored(self, root: Any) -> dict[str, str]:
+    def ignored(self, root: Any) -> Reasons:
         """A single position has all of the probability."""
         return {"low_probability": "with support_size=1"} if self.support_size == 1 else {}
 

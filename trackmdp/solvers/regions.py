@@ -42,7 +42,7 @@ from trackmdp.solvers.partition import (
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.value import value_of
 from trackmdp.solvers.walk import Step
-from trackmdp.solvers.workers import Crew, Made, in_turn
+from trackmdp.solvers.workers import Crew, Made
 from trackmdp.world.model import World
 
 ROOM, SMALLEST_SIDE, LARGEST_SIDE = 2**28, 32, 128
@@ -217,9 +217,7 @@ def improved(
     return PolicyTable.from_sensed(world, end_to_end(found))
 
 
-def settled(
-    world: World, policy: PolicyTable, side: int, rounds: int, run: Crew = in_turn
-) -> PolicyTable:
+def settled(world: World, policy: PolicyTable, side: int, rounds: int, run: Crew) -> PolicyTable:
     """The policy after at most `rounds` of `improved`, each done by `run`, fewer where no value grows.
 
     Blocks that planned without each other's values leave plans that none of them would change: .006 per step at

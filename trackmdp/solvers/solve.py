@@ -141,8 +141,8 @@ def _closes(world: World, choice: BaselineConfig, partition: SweptPartitionConfi
 def solve_group(
     group: Group,
     choice: BaselineConfig,
-    on_progress: OnProgress = None,
-    partition: SweptPartitionConfig | None = None,
+    on_progress: OnProgress,
+    partition: SweptPartitionConfig,
 ) -> GroupSolution:
     """Plans of single targets by a config's solver, and the bound for all of them together."""
     started = time.monotonic()

@@ -184,7 +184,7 @@ class Several:
 
 
 def beside(
-    rule: Rule, cfg: OptimalBoundConfig, *, width: float, seed: int, single: Solution | None = None
+    rule: Rule, cfg: OptimalBoundConfig, *, width: float, seed: int, single: Solution | None
 ) -> Several:
     """The figures of a policy, and of the optima of single targets, merged.
 
