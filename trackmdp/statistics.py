@@ -41,7 +41,7 @@ def mean_over_groups(groups: Sequence[Sequence[float]]) -> MeanInterval:
 
     A sample without any spread is no estimate of the spread: there is no interval.
     """
-    filled = [np.asarray(group, dtype=float) for group in groups if len(group)]
+    filled = [np.asarray(group, float) for group in groups if len(group)]
     count = sum(map(len, filled))
     if not count:
         return MeanInterval(math.nan, None, None, 0)

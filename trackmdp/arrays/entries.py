@@ -44,7 +44,7 @@ def ones_at(
     rows: IndexArray, columns: IndexArray, shape: tuple[int, int], kind: Any = np.bool_
 ) -> sparse.csr_array:
     """Ones in these places `[E]`, true or as numbers of a `kind`, of which those in one place are added up."""
-    return sparse.csr_array((np.ones(len(rows), dtype=kind), (rows, columns)), shape=shape)
+    return sparse.csr_array((np.ones(len(rows), kind), (rows, columns)), shape=shape)
 
 
 def summing(index: IndexArray, count: int) -> sparse.csr_array:
@@ -103,5 +103,5 @@ def among(known: IndexArray, wanted: IndexArray) -> tuple[IndexArray, BoolArray]
     # With 37 and 41, 41 is at place 1, and so is 38, another number. The place of 50 would be 2: beyond the last.
     place = np.minimum(np.searchsorted(known, wanted), max(len(known) - 1, 0))
     if not len(known):
-        return place, np.zeros(place.shape, dtype=np.bool_)
+        return place, np.zeros(place.shape, np.bool_)
     return place, known[place] == wanted

@@ -81,7 +81,7 @@ def one_each(
     try:
         if np.iscomplexobj(given):  # would lose their imaginary part
             raise TypeError
-        values, rows = np.asarray(given, dtype=np.float64), ""
+        values, rows = np.asarray(given, np.float64), ""
     except (TypeError, ValueError):
         raise UserError(f"{source}: {given!r:.40}, expected numbers") from None
     if isinstance(count, tuple):

@@ -191,7 +191,7 @@ class TrackVector(_Tracked, VectorEnv[Observation, npt.NDArray[np.int8], npt.NDA
     def _final(self, seen: Observation, done: npt.NDArray[np.bool_]) -> dict[str, Any]:
         """Last observations, in the form of Gymnasium's own vector environments: a mask beside each key."""
         # Not by `VectorEnv._add_info`, a row at a time: steps of 1,024 targets took half as long again.
-        final = np.full(self.num_envs, None, dtype=object)
+        final = np.full(self.num_envs, None, object)
         for row in np.flatnonzero(done):
             final[row] = {key: value[row] for key, value in seen.items()}
         target = self._env.target.numpy()

@@ -70,7 +70,7 @@ def picture(
     if mode != "rgb_array":
         legend = PICTURE_LEGEND if cell.size == 1 else LEGEND_OF_SEVERAL
         return "\n".join([*(" ".join(row) for row in marks), legend])
-    pixels = np.full((*marks.shape, _SIDE, _SIDE, 3), 255, dtype=np.uint8)
+    pixels = np.full((*marks.shape, _SIDE, _SIDE, 3), 255, np.uint8)
     for alike, colour in _COLOURS.items():
         here = np.isin(marks, list(alike))
         # A boolean index picks whole tiles, [hits, side, side, 3], and their inner part gets the colour.

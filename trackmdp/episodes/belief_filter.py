@@ -28,7 +28,7 @@ def beliefs(world: World, episodes: Sequence[Episode]) -> list[Floats]:
     mode = np.concatenate(
         [0 * each.target if each.mode is None else each.mode for each in episodes]
     )
-    found = np.zeros((len(target), world.num_cells), dtype=np.float32)
+    found = np.zeros((len(target), world.num_cells), np.float32)
     start, start_mode = (
         np.array([getattr(each, name) for each in episodes]) for name in ("start", "start_mode")
     )

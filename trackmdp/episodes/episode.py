@@ -112,7 +112,7 @@ class Episode(Carded):
         if not self.several:
             return self.belief[t]
         rows = self.belief[t * len(self.start) : (t + 1) * len(self.start)]
-        return np.asarray(rows.sum(axis=0), dtype=np.float64)
+        return np.asarray(rows.sum(axis=0), np.float64)
 
     def to_tensordict(self, task: Task) -> TensorDict:
         """`[T]` steps under the keys of `TrackEnv`, as a rollout has them: the outcome of each step under `next`.

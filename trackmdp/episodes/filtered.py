@@ -46,7 +46,7 @@ def simulate_filter(
     ).T  # [t_max + 1, M], worth of knowing the cell over a miss
     rng = np.random.default_rng(derive(seed, "false_alarm"))
     target, totals, watched = rng.integers(m, size=episodes), np.zeros((6, episodes)), np.zeros(m)
-    belief, misses, row = np.eye(m)[target], np.zeros(episodes, dtype=np.int64), np.arange(episodes)
+    belief, misses, row = np.eye(m)[target], np.zeros(episodes, np.int64), np.arange(episodes)
     while len(row):
         moves, chances = rng.random(len(row)), rng.random((len(row), m))
         predicted, forced = belief @ kernel, misses > world.t_max

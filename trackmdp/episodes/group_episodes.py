@@ -134,7 +134,7 @@ class _Batch:
         """The columns of a step."""
         task, row = self._task, step.row
         some, seen = np.any(step.present[row], axis=1), step.seen[row]
-        action = np.zeros((self._shape[0], task.total_sensors), dtype=bool)
+        action = np.zeros((self._shape[0], task.total_sensors), bool)
         action.ravel()[step.on] = True
         action = action[row]
         spent = self._costs.price_of(torch.from_numpy(action))

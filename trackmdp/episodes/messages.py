@@ -160,22 +160,21 @@ class Form:
         """The episode of a row, the contents of its steps, and its messages by topic."""
         task, targets, has_mode = self.task, len(self.problem.targets), modes_of(self.problem) > 1
         misses, target, seen = (
-            np.array([each[name] for each in said], dtype=np.int64)
-            for name in ("n", "target", "obs")
+            np.array([each[name] for each in said], np.int64) for name in ("n", "target", "obs")
         )
-        start, shape = np.array(row["start"], dtype=np.int64), (targets,) if targets else ()
+        start, shape = np.array(row["start"], np.int64), (targets,) if targets else ()
         if start.shape != shape or any(
             each.shape != (len(said), *shape) for each in (misses, target, seen)
         ):
             raise ValueError(f"steps or starts of other than {targets or 1} targets")
-        action = np.zeros((len(said), task.total_sensors), dtype=bool)
+        action = np.zeros((len(said), task.total_sensors), bool)
         for t, each in enumerate(said):
             action[t, each["active"]] = True
         start = np.where(start < 0, task.num_cells, start)
         reward = np.array([each["reward"] for each in said])
         if np.any(start > task.num_cells - (not targets)) or np.any(abs(reward) > _HUGE):
             raise ValueError("a start outside of the grid, or a reward out of range")
-        modes = np.array([each["mode"] for each in said], dtype=np.int64) if has_mode else None
+        modes = np.array([each["mode"] for each in said], np.int64) if has_mode else None
         return Episode(
             number=row["episode"],
             seed=int(row["seed"]),

@@ -80,7 +80,7 @@ def _can_exit(kernel: sparse.csr_array, sums: npt.NDArray[np.float64]) -> npt.ND
     before = np.concatenate([kernel.indices, np.full(len(leaves), m)])
     after = np.concatenate([row_index(kernel), leaves])
     graph = ones_at(before, after, (m + 1, m + 1), np.int8)
-    reached = np.zeros(m + 1, dtype=bool)
+    reached = np.zeros(m + 1, bool)
     reached[breadth_first_order(graph, m, return_predecessors=False)] = True
     return reached[:m]
 

@@ -114,7 +114,7 @@ def regimes(
         _regime(size, f"kernel.regimes[{place}]", entry) for place, entry in enumerate(regimes)
     ]
     count = len(kernels)
-    kept = np.broadcast_to(np.asarray(stay, dtype=np.float64), (count,))
+    kept = np.broadcast_to(np.asarray(stay, np.float64), (count,))
     return switching(
         kernels, np.where(np.eye(count) > 0, kept[:, None], (1.0 - kept[:, None]) / (count - 1))
     ), count

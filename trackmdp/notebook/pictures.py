@@ -85,7 +85,7 @@ def _run(run: Any) -> Picture:
     columns, summary = run.columns, run.summary
     tracks = summary.get("held_out") is not None
     learning = "while learning, validation tracks" if tracks else "while learning"
-    lines = {learning: np.array(columns.get("aihtr", ()), dtype=float)}  # None becomes nan
+    lines = {learning: np.array(columns.get("aihtr", ()), float)}  # None becomes nan
     levels = {"learned, held-out tracks" if tracks else "learned": run.evaluation.aihtr}
     for name, part, key in (("Q_MDP", "qmdp", "aihtr"), ("upper bound", "optimal", "upper")):
         if summary.get(part):
@@ -113,7 +113,7 @@ def _policy(policy: Any) -> Picture:
     values = np.full(task.num_cells, np.nan)
     # From the last n to the first: a cell sensed at several keeps the smallest.
     for n in reversed(range(task.num_choices)):
-        on = np.zeros(task.total_sensors, dtype=bool)
+        on = np.zeros(task.total_sensors, bool)
         on[policy.sensors(int(task.keys.start(cell, 0)), n)] = True
         values[task.covered(on)] = n
     title = "cells sensed after a detection in the framed cell"

@@ -73,7 +73,7 @@ class Following(ABC):
 
     def _action(self) -> BoolArray:
         """`[S]` whether each sensor is on."""
-        action = np.zeros(self._task.total_sensors, dtype=bool)
+        action = np.zeros(self._task.total_sensors, bool)
         action[self._on or []] = True
         return action
 
@@ -160,7 +160,7 @@ def probabilities(given: Any, states: int) -> Array:
     """
     numbers = given if isinstance(given, list) else []
     if all(type(each) in (int, float) and 0 <= each <= 1.1 for each in numbers):
-        found = np.array([numbers], dtype=np.float64)
+        found = np.array([numbers], np.float64)
         if found.shape[1] == states and (not found.any() or abs(found.sum() - 1.0) < 1e-6):
             return found
     raise UserError(f"state: belief, expected {states} probabilities that sum to 1")

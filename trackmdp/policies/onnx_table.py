@@ -54,7 +54,7 @@ class OnnxTable:
         names = (each.name for each in self._session.get_inputs())
         state = {name: np.array([it]) for name, it in zip(names, (key, misses), strict=True)}
         (action,) = self._session.run(["action"], state)
-        return np.asarray(action[0], dtype=np.bool_)
+        return np.asarray(action[0], np.bool_)
 
 
 def _task(about: dict[str, str], sensors: int) -> Task:

@@ -90,7 +90,7 @@ def unpacked_policy(task: Task, content: Mapping[str, AnyArray]) -> PolicyTable:
     if "probability" in content:
         return PolicyTable(task, probability=float(content["probability"]), k=k)
     indices, indptr = content["indices"], content["indptr"]
-    data = content.get("data", np.ones(len(indices), dtype=bool))
+    data = content.get("data", np.ones(len(indices), bool))
     sets = whole_csr(data, indices, indptr, (task.num_keys * task.num_choices, task.total_sensors))
     if not np.isfinite(sets.data).all():
         raise UserError("a probability that is not finite")

@@ -75,7 +75,7 @@ class SetTable:
         found = np.empty(len(columns))
         for begin in range(0, len(columns), _AT_ONCE):
             part = slice(begin, begin + _AT_ONCE)
-            row = np.asarray(plans[part], dtype=np.int64) * self.task.num_choices + n
+            row = np.asarray(plans[part], np.int64) * self.task.num_choices + n
             row = 0 * row if self.alike else row
             found[part] = table[row, columns[part]]
         return found
@@ -261,7 +261,7 @@ class PolicyTable(Carded, SetTable):
     def written(self) -> sparse.csr_array:
         """`[keys * (t_max + 1), S]` sets, also where one row stands for all."""
         rows = self.task.num_keys * self.task.num_choices
-        return self.sets[np.zeros(rows, dtype=np.int64)] if self.alike else self.sets
+        return self.sets[np.zeros(rows, np.int64)] if self.alike else self.sets
 
     def as_lists(self) -> dict[str, Any]:
         """Plain lists, as `sets.json` has them: rows and columns, t_max, and each key's sensors on at n = 0 ... t_max.
@@ -324,7 +324,7 @@ def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
     sets.sum_duplicates()  # sorts the columns of each row as well
     sets.eliminate_zeros()
     if sets.shape != expected and task.window is not None and sets.nnz:
-        sets = sets[np.zeros(expected[0], dtype=np.int64)]  # each cell has a window of its own
+        sets = sets[np.zeros(expected[0], np.int64)]  # each cell has a window of its own
     _check_choosable(task, task.keys, sets)
     return sets
 

@@ -209,7 +209,7 @@ class Tracker(Following):
     def _chosen(self) -> list[int]:
         """See `Following`."""
         policy = self._policy
-        sensors = np.array(policy.sensors(self.key, self.misses), dtype=np.int64)
+        sensors = np.array(policy.sensors(self.key, self.misses), np.int64)
         kept = self._possible(sensors)
         sensors = sensors[kept]
         if isinstance(policy, OnnxTable) or policy.deterministic:
@@ -225,7 +225,7 @@ class Tracker(Following):
         """See `Following`."""
         start = None if self.safe else np.full(len(sensors), self.cell)
         possible = self._task.choosable(start, sensors)
-        return np.ones(len(sensors), dtype=bool) if possible is None else possible
+        return np.ones(len(sensors), bool) if possible is None else possible
 
 
 def _plan(policy: Plan | str | Path) -> Plan:

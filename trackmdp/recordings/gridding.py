@@ -164,7 +164,7 @@ def _utm(x: Array, y: Array, source: str) -> str:
 
 def _breaks(positions: Positions, grid: Gridding) -> np.ndarray:
     """`[P]` whether a report is the first of an uninterrupted path."""
-    first = np.ones(len(positions.time), dtype=bool)
+    first = np.ones(len(positions.time), bool)
     # 1e-9: times since 1970 have errors of 1e-7 s, and a gap of exactly `max_gap` is bridged.
     gap = np.diff(positions.time) > grid.max_gap * (1 + 1e-9) + 1e-6
     first[1:] = (np.diff(positions.piece) != 0) | gap

@@ -56,7 +56,7 @@ class Together:
     @cached_property
     def groups(self) -> Indices:
         """`[G, K]`, all tracks, each in one group: the same in every process."""
-        rng, free, found = np.random.default_rng(0), np.ones(len(self.tracks), dtype=bool), []
+        rng, free, found = np.random.default_rng(0), np.ones(len(self.tracks), bool), []
         shuffled = rng.permutation(len(self.tracks))
         for leader in shuffled[np.argsort(self._begin[shuffled], kind="stable")]:
             if free[leader]:

@@ -92,7 +92,7 @@ class Tracks:
         # Example: the tracks 3 4 (exit) and 7 8 stand end to end as cells = 3 4 M 7 8 with first = 0 3 5. Every place
         # but a track's last one (2 and 4) begins a step: 3 to 4, 4 to M, 7 to 8.
         line = self.closed(num_cells)
-        begins = np.ones(len(line.cells), dtype=bool)
+        begins = np.ones(len(line.cells), bool)
         begins[line.first[1:] - 1] = False
         at = np.flatnonzero(begins)
         return line.cells[at], line.cells[at + 1]
@@ -115,9 +115,9 @@ class Tracks:
         # Track 3 4, which exits, and track 7 8, which stops: points 0 1 2 3, moves from 0 to 1 and from 2 to 3. Point 1
         # has none, so that the target exits; point 3 has none either, but the recording stops there.
         points, last = len(self.cells), self.first[1:] - 1
-        goes_on = np.ones(points, dtype=bool)
+        goes_on = np.ones(points, bool)
         goes_on[last] = False
-        ends = np.zeros(points, dtype=bool)
+        ends = np.zeros(points, bool)
         ends[last] = ~self.exits
         count = ends_of(goes_on.astype(np.int64))
         moves = sparse.csr_array(

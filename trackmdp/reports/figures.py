@@ -85,7 +85,7 @@ def _line_figure(
             moved = shift * (place - (learned - 1) / 2) if place < learned else 0.0
             x = np.asarray(line.x) + moved
             # `[3, K]`; without an interval, None, its ends are the mean.
-            ends = np.array([(each.mean, each.low, each.high) for each in line.row], dtype=float).T
+            ends = np.array([(each.mean, each.low, each.high) for each in line.row], float).T
             mean, low, high = np.maximum(np.where(np.isnan(ends), ends[0], ends), floor)
             marks = (2 * place % thin, thin) if thin > 1 else None
             axes.plot(x, mean, label=line.name, markevery=marks, **vars(line.look))

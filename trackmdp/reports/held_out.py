@@ -183,7 +183,7 @@ def _shaded(problem: Recorded, share: Array) -> str:
 
 def _part(problem: Recorded, episodes: Iterable[Episode]) -> Extent:
     """The smallest part of the grid with all that is drawn of some episodes."""
-    seen = np.zeros(problem.num_cells + 1, dtype=bool)  # the exit is cell M
+    seen = np.zeros(problem.num_cells + 1, bool)  # the exit is cell M
     for episode in episodes:
         seen[[episode.start, *episode.target[:_STEPS]]] = True
         seen[:-1] |= problem.covered(episode.action[:_STEPS]).any(axis=0)

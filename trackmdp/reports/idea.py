@@ -74,7 +74,7 @@ def scenes(drawn: Mapped) -> list[Scene]:
     # The likeliest pair of an unsensed cell y and a sensed cell z after it.
     pairs = left[:, None] * kernel.toarray() * sensed
     y, z = np.unravel_index(int(pairs.argmax()), pairs.shape)
-    none, gone = np.zeros(len(left), dtype=bool), left.sum()
+    none, gone = np.zeros(len(left), bool), left.sum()
     here = np.arange(len(left)) == x
     return [
         Scene("1  located", here.astype(np.float64), none, x, found=True),

@@ -32,7 +32,7 @@ def largest(rows: IndexArray, net: Array, count: int) -> BoolArray:
     """`[G, C]`, the `count` decisions of each row with the largest `net` `[G, C]`, of equal ones the first."""
     order = np.argsort(-net, axis=0, kind="stable")
     by_row = np.argsort(rows[order], axis=0, kind="stable")
-    rank = np.empty(net.shape, dtype=np.int64)
+    rank = np.empty(net.shape, np.int64)
     ranked = np.take_along_axis(order, by_row, axis=0)
     np.put_along_axis(rank, ranked, ranks(rows)[:, None], axis=0)
     return rank < count

@@ -177,7 +177,7 @@ class Shared:
         """
         kept = self.distinct(price[:, 0])
         if len(kept) < len(price):
-            on = np.zeros(price.shape, dtype=bool)
+            on = np.zeros(price.shape, bool)
             mark = kept.tobytes()
             if mark not in self._parts:  # prices of a row hardly ever change their order
                 self._parts.clear()
@@ -218,7 +218,7 @@ class Shared:
         lengths = np.diff(first, append=len(self.rows))
         on, place = on.copy(), np.arange(len(self.rows))[:, None]
         while len(first):
-            change, over = self.changes(on, gain, price), np.zeros(1, dtype=bool)
+            change, over = self.changes(on, gain, price), np.zeros(1, bool)
             if self.budget is not None:
                 number = np.add.reduceat(on, first, axis=0, dtype=np.int64)
                 full = np.repeat(number >= self.budget, lengths, axis=0)
@@ -268,10 +268,10 @@ class Shared:
     def _kind(self) -> IndexArray:
         """`[G]`, one number for all decisions that see the same entries, 0 ... without gaps."""
         (count, entries), start = self.sees.shape, self.sees.indptr[:-1]
-        length, kind = np.diff(self.sees.indptr), np.zeros(count, dtype=np.int64)
+        length, kind = np.diff(self.sees.indptr), np.zeros(count, np.int64)
         for place in range(int(length.max(initial=0))):
             # Decisions alike up to here differ by their next entry; `entries` stands for none.
-            entry = np.full(count, entries, dtype=np.int64)
+            entry = np.full(count, entries, np.int64)
             entry[length > place] = self.sees.indices[start[length > place] + place]
             kind = np.unique(kind * (entries + 1) + entry, return_inverse=True)[1]
         return kind
@@ -288,7 +288,7 @@ class Shared:
         use = use[self.sees[use] @ np.maximum(gain, 0.0) > price[use]]
         if not exact:
             return self._relaxed(use, gain, price)
-        few = np.zeros(self.count, dtype=bool) if self.perfect else self._few(use)
+        few = np.zeros(self.count, bool) if self.perfect else self._few(use)
         sets, upper = self._of_all(use[few[self.rows[use]]], gain, price)
         if not few.all():
             relaxed = self._relaxed(use[~few[self.rows[use]]], gain, price)
@@ -305,12 +305,12 @@ class Shared:
         on, upper, most = np.zeros(len(price)), np.zeros(self.count), np.ones(len(entries))
         if len(use):
             if not self.perfect:
-                most -= self.some(use)._unreported(np.ones((len(use), 1), dtype=bool))[entries, 0]
+                most -= self.some(use)._unreported(np.ones((len(use), 1), bool))[entries, 0]
             limited = self._sums[: 0 if self.budget is None else None, use]
             on[use], worth, mu = relaxed(sees, value, cost, most, limited, self.budget or 0)
             spare = np.zeros(self.count) if self.budget is None else mu
             # The bound of the module's text: of the entries, of the sensors, and of the budget.
-            owner = np.zeros(len(entries), dtype=np.int64)
+            owner = np.zeros(len(entries), np.int64)
             pairs = sees.tocoo()
             owner[pairs.col] = self.rows[use][pairs.row]
             upper = per_row(owner, most * (value - worth), self.count)
@@ -331,7 +331,7 @@ class Shared:
 
     def _of_all(self, use: IndexArray, gain: Array, price: Array) -> tuple[BoolArray, Array]:
         """The best of all sets `[G]` of the decisions `use`, and its gain `[K]`."""
-        on, most = np.zeros(len(self.rows), dtype=bool), np.zeros(self.count)
+        on, most = np.zeros(len(self.rows), bool), np.zeros(self.count)
         width = np.bincount(self.rows[use], minlength=self.count)
         for count in np.unique(width[width > 0]).tolist():
             rows = np.flatnonzero(width == count)
@@ -347,10 +347,10 @@ class Shared:
         row, sensor = np.divmod(logs.col, width)
         # The entries of a row are numbered from 0; all rows get as many, those that they lack without gain.
         entries, entry = np.unique(logs.row, return_inverse=True)
-        owner = np.zeros(len(entries), dtype=np.int64)
+        owner = np.zeros(len(entries), np.int64)
         owner[entry] = row
         order = np.argsort(owner, kind="stable")
-        place = np.empty(len(order), dtype=np.int64)
+        place = np.empty(len(order), np.int64)
         place[order] = ranks(owner[order])
         shape = (len(these), int(place.max(initial=0)) + 1)
         dense, gains = np.zeros((len(these), width, shape[1])), np.zeros(shape)

@@ -74,5 +74,5 @@ def integer(
         options={"mip_rel_gap": 0.0},
     )
     if found.x is None:
-        return np.zeros(p, dtype=bool), np.inf
+        return np.zeros(p, bool), np.inf
     return found.x[:p] > 0.5, float(-found.mip_dual_bound) / scale * (1.0 + PROVED)

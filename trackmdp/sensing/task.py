@@ -262,7 +262,7 @@ class Task(Carded):
             near = apart(self.columns, start, sensors) <= self.window
         else:
             # SciPy gives a sparse array, not one of bools, where no pair is asked for.
-            near = self.sensors_near[start, sensors] if len(start) else np.zeros(0, dtype=np.bool_)
+            near = self.sensors_near[start, sensors] if len(start) else np.zeros(0, np.bool_)
         return near if possible is None else near & possible
 
     @cached_property

@@ -65,7 +65,7 @@ _SEEN = 1e-12
 def _flips() -> BoolArray:
     """`[SINGLES + 1, C]` whether each candidate flips the sensor of each rank; the last row is for all others."""
     pairs = [*((rank,) for rank in range(SINGLES)), *itertools.combinations(range(PAIRED), 2)]
-    flipped = np.zeros((SINGLES + 1, len(pairs)), dtype=bool)
+    flipped = np.zeros((SINGLES + 1, len(pairs)), bool)
     for candidate, places in enumerate(pairs):
         flipped[list(places), candidate] = True
     return flipped
@@ -144,7 +144,7 @@ def exchanged(
         exact: whether sets of shared sensors are at last the best ones, by linear programs.
     """
     renewal = policy.renewal
-    everywhere = np.ones(len(renewal.plans), dtype=bool)
+    everywhere = np.ones(len(renewal.plans), bool)
     tried = everywhere
     for _ in range(0 if policy.settled else rounds):
         if policy.visits is None:
@@ -174,7 +174,7 @@ def could_gain(plans: Plans, policy: Found) -> BoolArray:
     """`[K]`, whether a plan is worth less than it could be if the position were revealed after every set."""
     renewal, world = policy.renewal, policy.renewal.world
     if renewal.size is None:
-        return np.ones(len(renewal.plans), dtype=bool)
+        return np.ones(len(renewal.plans), bool)
     detected = world.reward + policy.value[: world.num_cells]
     most = revealed(world, detected, forced_worth(world, detected), plans.length)
     return hopeful(plans, policy.sets, most)
@@ -228,7 +228,7 @@ def _parts(plans: Plans, rows: IndexArray) -> Iterator[IndexArray]:
 
 def _cut(plans: Plans, rows: IndexArray) -> tuple[Plans, list[IndexArray]]:
     """The plans of some rows, and which decisions are theirs, for each step."""
-    some = np.zeros(plans.count, dtype=bool)
+    some = np.zeros(plans.count, bool)
     some[rows] = True
     number = np.cumsum(some) - 1
     start = now = np.flatnonzero(some[plans.turns[0].before])
@@ -295,6 +295,6 @@ def _ranks(plans: Plans, step: int, plan: list[BoolArray], mass: Array) -> Index
         possible &= choice.allowed[:, 0]
     # Least margin first within each row, the impossible ones last.
     order = np.lexsort((margin, ~possible, choice.rows))
-    rank = np.empty(len(order), dtype=np.int64)
+    rank = np.empty(len(order), np.int64)
     rank[order] = np.minimum(ranks(choice.rows), SINGLES)
     return np.where(possible, rank, SINGLES)

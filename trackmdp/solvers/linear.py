@@ -86,7 +86,7 @@ class RenewalSystem:
         Raises:
             UserError: from some cell the target never exits.
         """
-        wanted = np.asarray(gathered, dtype=np.float64)
+        wanted = np.asarray(gathered, np.float64)
         if self.exact:
             total = self._solve(wanted, transposed)
         elif transposed:

@@ -66,7 +66,7 @@ def _first_set(problem: InnerProblem, mass: Array, states: IndexArray) -> BoolAr
     # Without trees optimism is that of a search that is left after one more miss.
     known = tables(problem, slack=slack, run=run) if cellwise else [problem.missed] * problem.length
     plans, sets = first_guess(problem, known, mass)
-    sets = exchange(plans, sets, np.ones(world.num_cells, dtype=bool))
+    sets = exchange(plans, sets, np.ones(world.num_cells, bool))
     if not cellwise:
         return sets[0]
     # One problem per located cell: its undetected mass after the sets carried out so far.

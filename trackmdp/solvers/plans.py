@@ -233,4 +233,4 @@ class Plans:
 
     def none(self) -> list[BoolArray]:
         """Sets to start from: no sensor is on."""
-        return [np.zeros((len(turn.price), 1), dtype=bool) for turn in self.turns]
+        return [np.zeros((len(turn.price), 1), bool) for turn in self.turns]

@@ -155,7 +155,7 @@ def solve(world: World, *, most_beliefs: int = 50_000) -> BeliefSolution:
 def _subsets(possible: BoolArray) -> BoolArray:
     """Every set of possible cells, the fullest first; to sense an impossible one as well only costs."""
     cells = np.flatnonzero(possible)
-    sets = np.zeros((2 ** len(cells), len(possible)), dtype=bool)
+    sets = np.zeros((2 ** len(cells), len(possible)), bool)
     sets[:, cells] = list(itertools.product([True, False], repeat=len(cells)))
     return sets
 

@@ -120,7 +120,7 @@ def risen(policy: Found, plans: Plans, sets: Sequence[BoolArray]) -> Found | Non
         # With the visits as they are so little is gained that it would not count: not worth an exact evaluation.
         if not renewal.single and gain[rows].sum() <= policy.rounding:
             continue
-        chosen = np.zeros(plans.count, dtype=bool)
+        chosen = np.zeros(plans.count, bool)
         chosen[rows] = True
         tried = Found(renewal, mixed(turns, chosen, sets, old), policy)
         if tried.aihtr > policy.aihtr + policy.rounding:
@@ -143,7 +143,7 @@ def _gaining(policy: Found, sets: Sequence[BoolArray], order: IndexArray) -> Ind
     visits, most = policy.visits[states], policy.rounding
     gain = system.residual(earned, policy.value)[states]
     change = np.eye(len(states)) - policy.system.changed(system, states)
-    taken = np.zeros(len(order), dtype=bool)
+    taken = np.zeros(len(order), bool)
     ends = ends_of(np.array([len(each) for each in events]))
     for place, (low, high) in enumerate(itertools.pairwise(ends)):
         here, later = slice(low, high), slice(high, None)
@@ -161,7 +161,7 @@ def rows_changed(
     turns: Sequence[Turn], before: Sequence[BoolArray], after: Sequence[BoolArray]
 ) -> BoolArray:
     """`[K]`, the rows in which the sets differ."""
-    found = np.zeros(turns[0].choice.count, dtype=bool)
+    found = np.zeros(turns[0].choice.count, bool)
     for turn, old, new in zip(turns, before, after, strict=True):
         found[turn.choice.rows[(old != new)[:, 0]]] = True
     return found

@@ -215,7 +215,7 @@ def _moves(
     """`[E_before, E]` of the moves `data` of `live` entries, each to its `target`, or to an entry of its own."""
     every: Indices = counts.astype(np.int64, copy=False)
     if live is not None:
-        every = np.zeros(shape[0], dtype=np.int64)
+        every = np.zeros(shape[0], np.int64)
         every[live] = counts
     pointer = ends_of(every)
     width = index_type(max(len(data), *shape))
@@ -256,7 +256,7 @@ def all_events(
 def _along_tracks(task: Task, motion: Motion, starts: Events, reports: Reports | None) -> Events:
     """See `all_events`: step by step along all tracks at once, since what follows an event is a few steps later."""
     points = np.arange(motion.num_states)
-    begins = np.ones(len(points), dtype=bool)
+    begins = np.ones(len(points), bool)
     begins[motion.moves.indices] = False
     step = points - np.maximum.accumulate(np.where(begins, points, 0))
 
@@ -265,7 +265,7 @@ def _along_tracks(task: Task, motion: Motion, starts: Events, reports: Reports |
 
     order = np.argsort(steps_of(starts.codes), kind="stable")
     begun = np.split(starts.codes[order], np.cumsum(np.bincount(steps_of(starts.codes)))[:-1])
-    known, later = [], np.zeros(0, dtype=np.int64)
+    known, later = [], np.zeros(0, np.int64)
     for now in range(int(step.max()) + 1):
         here = steps_of(later) <= now
         some = np.concatenate([later[here], *begun[now : now + 1]])

@@ -23,7 +23,7 @@ def cell_classes(share: str | None, size: tuple[int, int]) -> IndexArray | None:
     if share is None or share == "none":
         return None
     if share == "all":
-        return np.zeros(size[0] * size[1], dtype=np.int64)
+        return np.zeros(size[0] * size[1], np.int64)
     given = read_numbers("algo.share_cells", share, name="classes")
     cells = size[0] * size[1]
     # Up to 2^53 a float is the whole number that was written; beyond 2^63 two classes would become one.

@@ -62,7 +62,7 @@ class ObservedPaths:
         sets = [sparse.csr_array((0, cells)), *(part.sensed for part in parts)]
         columns: dict[str, Any] = {"sensed": sparse.vstack(sets)}
         for name in {each.name for each in fields(cls)} - {"sensed"}:
-            none = np.zeros(0, dtype=np.int64)
+            none = np.zeros(0, np.int64)
             columns[name] = np.concatenate([none, *(getattr(part, name) for part in parts)])
         return cls(**columns)
 
@@ -193,7 +193,7 @@ def hidden_cells(
     """
     moves, backward, leave = _directions(kernel)
     place = np.cumsum(paths.misses) - paths.misses
-    found = np.empty(int(paths.misses.sum()), dtype=np.int64)
+    found = np.empty(int(paths.misses.sum()), np.int64)
     for n in np.unique(paths.misses[paths.misses > 0]):
         whole = np.flatnonzero(paths.misses == n)
         for begin in range(0, len(whole), _AT_ONCE):

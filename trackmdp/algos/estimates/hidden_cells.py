@@ -82,7 +82,7 @@ class Moves:
 
     def __init__(self, task: Task, line: Tracks, unknown: BoolArray) -> None:
         self._size, self._cells = task.size, task.num_cells
-        goes_on = np.ones(len(line.cells), dtype=bool)
+        goes_on = np.ones(len(line.cells), bool)
         goes_on[line.first[1:] - 1] = False
         at = np.flatnonzero(goes_on)
         before, after = line.cells[at], line.cells[at + 1]
@@ -107,7 +107,7 @@ class Moves:
     def headings(self, line: Tracks) -> IndexArray:
         """`[P]` modes at the points of closed tracks: twice the place in `moves`, 1 more after a stop."""
         cells, place = line.cells, np.arange(len(line.cells))
-        number = np.zeros(len(cells), dtype=np.int64)
+        number = np.zeros(len(cells), np.int64)
         number[1:] = self.shift(cells[:-1], cells[1:])
         number[line.first[:-1]] = 0
         begin = np.repeat(line.first[:-1], line.lengths)

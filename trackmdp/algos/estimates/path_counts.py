@@ -191,9 +191,9 @@ class _Counted:
         """For each shared level, the context above each of its contexts."""
         keys = self._view.paths.task.keys
         *shared, _ = keys.contexts(np.arange(keys.num_classes))  # the classes as keys of cell 0
-        found: list[IndexArray] = [np.zeros(1, dtype=np.int64)]
+        found: list[IndexArray] = [np.zeros(1, np.int64)]
         for (context, count), (higher, _) in zip(shared[1:], shared, strict=False):
-            above = np.zeros(count, dtype=np.int64)
+            above = np.zeros(count, np.int64)
             above[context] = higher
             found.append(above)
         return found
@@ -241,7 +241,7 @@ class _Counted:
         # Keys of one class at a time: few displacements are worth a sensor after it, from any cell.
         order = np.argsort(known.astype(np.min_scalar_type(classes)), kind="stable")
         ends = np.cumsum(np.bincount(known, minlength=classes))
-        rows, columns = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+        rows, columns = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
         for at, most in zip(np.split(order, ends[:-1]), shared.most, strict=True):
             wanted = np.flatnonzero(most > view.least)
             if not (len(at) and len(wanted)):

@@ -147,7 +147,7 @@ def thinned(task: Task, tracks: Tracks, most: int, seed: int) -> Tracks:
 def different(tracks: Tracks) -> tuple[Tracks, IndexArray]:
     """The tracks that differ in where they lead, `[K]` of them, and how often each is there."""
     _, first, times = np.unique(_groups(tracks), return_index=True, return_counts=True)
-    chosen: BoolArray = np.zeros(len(tracks), dtype=bool)
+    chosen: BoolArray = np.zeros(len(tracks), bool)
     chosen[first] = True
     return tracks.select(chosen), times
 
@@ -156,7 +156,7 @@ def _groups(tracks: Tracks) -> IndexArray:
     """`[K]`, one number for all tracks that lead to the same cells, in the order in which they first come."""
     number: dict[tuple[bytes, bool], int] = {}
     each = zip(tracks.pieces(), tracks.exits.tolist(), strict=True)
-    return np.array([number.setdefault(piece, len(number)) for piece in each], dtype=np.int64)
+    return np.array([number.setdefault(piece, len(number)) for piece in each], np.int64)
 
 
 @dataclass(frozen=True)

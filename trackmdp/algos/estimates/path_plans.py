@@ -203,7 +203,7 @@ def exchanged_keys(
     plans = _trees(paths, followed, often)
     choices = [turn.choice for turn in plans.turns]
     before = sets_of(choices, table, often)
-    found = exchange(plans, plans.ascend(before, sweeps=2), np.ones(len(often), dtype=bool))
+    found = exchange(plans, plans.ascend(before, sweeps=2), np.ones(len(often), bool))
     gain = plans.worth_of(found) - plans.worth_of(before)
     new = [
         ones_at(*on, (len(often), paths.task.total_sensors))

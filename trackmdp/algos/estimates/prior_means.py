@@ -48,7 +48,7 @@ class PriorMeans:
     ) -> PriorMeans:
         """By counts of the keys seen: gains `[K, W]` and arrivals."""
         task, seen = paths.task, paths.keys
-        keys, row = task.keys, np.zeros(task.num_cells, dtype=np.int64)
+        keys, row = task.keys, np.zeros(task.num_cells, np.int64)
         if keys.num_classes == 1:  # a key is its cell, and has the same counts
             return cls(keys, common, row, np.ones_like(common), np.ones((1, 1)))
         cells, of_key = np.unique(keys.cell(seen), return_inverse=True)

@@ -170,8 +170,8 @@ class Tree:
 
     def improvements(self) -> tuple[BoolArray, list[LeftOut]]:
         """`[B]` which problems have found a better plan, and the cells that it leaves unsensed at each step."""
-        better, found = np.zeros(len(self.best), dtype=bool), []
-        problems = np.array(list(self._leaves), dtype=np.int64)
+        better, found = np.zeros(len(self.best), bool), []
+        problems = np.array(list(self._leaves), np.int64)
         better[problems] = True
         for t in range(len(self._revealed)):
             cells = [plan[t] for plan in self._leaves.values()]

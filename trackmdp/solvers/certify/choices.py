@@ -70,7 +70,7 @@ class Frontier:
         entry = entry[np.lexsort((-moved.data[entry], rows[entry]))]
         count = np.bincount(rows[entry], minlength=len(kept))
         shape = (len(kept), int(count.max(initial=0)))
-        cells, mass, loss = np.zeros(shape, dtype=np.intp), np.zeros(shape), np.zeros(shape)
+        cells, mass, loss = np.zeros(shape, np.intp), np.zeros(shape), np.zeros(shape)
         place = rows[entry], ranks(rows[entry])
         cells[place], mass[place], loss[place] = (
             moved.indices[entry],
@@ -99,7 +99,7 @@ class Choices:
     @classmethod
     def undecided(cls, frontier: Frontier) -> Choices:
         """Nothing decided yet in any state."""
-        states, none = np.arange(len(frontier.start)), np.zeros(frontier.cells.shape, dtype=bool)
+        states, none = np.arange(len(frontier.start)), np.zeros(frontier.cells.shape, bool)
         most = frontier.relaxed
         return cls(frontier, 0, states, none, most, np.zeros(len(states)), most)
 

@@ -67,7 +67,7 @@ class Beliefs:
     @classmethod
     def none(cls) -> Beliefs:
         """No entries, for a policy that reads none."""
-        nothing = np.zeros(0, dtype=np.int64)
+        nothing = np.zeros(0, np.int64)
         return cls(nothing, nothing, np.zeros(0))
 
     @classmethod

@@ -147,7 +147,7 @@ class GroupTracker(Following):
         place = np.array([0 if cell is None else self._cell("report", cell) for cell in cells])
         for cell in place[seen]:
             self._check_seen("report", int(cell))
-        on, moved = np.array(self._on, dtype=np.int64), self._beliefs.moved(self._group)
+        on, moved = np.array(self._on, np.int64), self._beliefs.moved(self._group)
         reports = present[None], seen[None]
         clocks, beliefs = followed(self._policy, before, moved, on, place[None], reports)
         lost = np.setdiff1d(np.flatnonzero(present & ~seen), beliefs.row)

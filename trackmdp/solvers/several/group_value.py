@@ -134,7 +134,7 @@ class _Drawn:
         self._sums = np.concatenate([[0.0], np.cumsum(self._kernel.data)])
         states, shape = group.states, (episodes, len(group))
         own = np.random.default_rng(rng.integers(2**63)).integers(states, size=shape)
-        self.state, self.inside = own + group.kind * states, np.ones(shape, dtype=bool)
+        self.state, self.inside = own + group.kind * states, np.ones(shape, bool)
 
     def move(self, row: IndexArray, step: int) -> None:  # noqa: ARG002
         """See `Moving`; every draw is made in every step."""

@@ -86,9 +86,9 @@ class Rule(ABC):
 
     def start(self, located: IndexArray, present: BoolArray | None = None) -> Clocks:
         """Targets of E episodes located in the cells `[E, K]`: all, or those that are `present` `[E, K]`."""
-        history = np.zeros((len(located), self.task.num_choices, self.sensors), dtype=bool)
+        history = np.zeros((len(located), self.task.num_choices, self.sensors), bool)
         kept = history if self.reads_history else None
-        here = np.ones(located.shape, dtype=bool) if present is None else present
+        here = np.ones(located.shape, bool) if present is None else present
         located = np.where(here, located, 0)
         key = self.keys.start(located) if self.keys.order else None
         return Clocks(located, np.zeros_like(located), here, kept, key)
@@ -148,7 +148,7 @@ class Rule(ABC):
         moved = Beliefs.none()
         if self.reads_beliefs:
             moved = Beliefs.recalled(self.group, seen).moved(self.group)
-        action = np.zeros((len(seen.present), self.sensors), dtype=bool)
+        action = np.zeros((len(seen.present), self.sensors), bool)
         action.reshape(-1)[self.sets(seen, moved)] = True
         action[seen.late(self.task.t_max)] = False
         past = parts[-1]
