@@ -18,7 +18,6 @@ from trackmdp.episodes.actors import Actor, States, actor_of
 from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.episode_draws import Columns, Draws, joined, narrow, uniform
 from trackmdp.episodes.group_episodes import GroupEpisodes, batches
-from trackmdp.errors import UserError
 from trackmdp.machine import check_free
 from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import PolicyLike
@@ -71,10 +70,8 @@ def simulate(
     whole_number("simulate: episodes", episodes, 0)
     if isinstance(problem, Group):
         policy = group_rule(problem, policy, **of_group)
-    elif of_group:
-        raise UserError(f"{min(of_group)}: an option of several targets, expected none with one")
     else:
-        policy = of_single(problem, policy)
+        policy = of_single(problem, policy, **of_group)
 
     def first(count: int) -> Any:
         return resimulate(problem, policy, episode_seeds(seed, count, *names))

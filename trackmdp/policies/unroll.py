@@ -17,6 +17,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, distributions
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from trackmdp.arrays.entries import row_index
 from trackmdp.arrays.types import AnyArray
 from trackmdp.policies.forms import (
     TAKE_ITS_MODE,
@@ -134,7 +135,7 @@ def _table(
     # One key takes a history of (t_max + 1) K bools; blocks keep all of them from being there at once.
     at_once = max(1, _HISTORY_AT_ONCE // (choices * k))
     window, mask = Window.of(task, device), ActionMask(task, device)
-    columns, values, lengths = [], [], []
+    blocks = []
     for begin in range(0, task.num_keys, at_once):
         keys = torch.arange(begin, min(begin + at_once, task.num_keys), device=device)
         cells = task.keys.cell(keys)
@@ -144,19 +145,14 @@ def _table(
             on *= window.inside(cells).repeat_interleave(choices, dim=0).cpu().numpy()
         if mask.observed:
             on *= mask(cells).repeat_interleave(choices, dim=0).cpu().numpy()
-        # Row-major order: flat place p of [rows, K] is column p mod K. Without a window K = S and columns are sensors.
-        place = np.flatnonzero(on)
-        chosen = place % k
+        block = sparse.csr_array(on)  # without a window K = S, and columns are sensors
         if window.is_local:
             # A window's local numbers go through it row by row, as the cells do: columns stay in order.
-            chosen = window.around(cells).cpu().numpy()[place // (k * choices), chosen]
-        columns.append(chosen)
-        values.append(on.reshape(-1)[place])
-        # Sensors on per row; their running sum is the CSR row pointer.
-        lengths.append(np.count_nonzero(on, axis=1))
-    indptr = np.concatenate([[0], np.cumsum(np.concatenate(lengths))])
-    found = np.concatenate(values), np.concatenate(columns), indptr
-    return sparse.csr_array(found, shape=(task.num_keys * choices, task.total_sensors))
+            sensors = window.around(cells).cpu().numpy()[row_index(block) // choices, block.indices]
+            parts, shape = (block.data, sensors, block.indptr), (len(on), task.total_sensors)
+            block = sparse.csr_array(parts, shape=shape)
+        blocks.append(block)
+    return sparse.vstack(blocks, format="csr")
 
 
 def _followed(rule: Rule, task: Task, keys: Tensor, dtype: torch.dtype) -> AnyArray:

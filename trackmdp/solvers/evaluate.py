@@ -59,9 +59,7 @@ def evaluate(
             raise UserError(f"false_alarm={false_alarm}: expected 0 with several targets")
         return _of_group(problem, policy, **of_group)
     check_problem(problem, "evaluate")
-    if of_group:
-        raise UserError(f"{min(of_group)}: an option of several targets, expected none with one")
-    table = policy_table(problem, policy)
+    table = policy_table(problem, policy, **of_group)
     if false_alarm:
         value.check_revealed(problem.motion, table)
         return believed(problem, table, false_alarm)
@@ -100,17 +98,19 @@ def group_rule(group: Group, policy: Any, merge: str | None = None) -> Rule:
     return make_rule(group, rule.tables, merge)
 
 
-def policy_table(problem: Problem, policy: PolicyLike | Array | BoolArray) -> PolicyTable:
-    """The table of a policy in any form; a name is that of a baseline."""
-    return value.as_table(problem, of_single(problem, policy))
+def policy_table(problem: Problem, policy: Any, **of_group: Any) -> PolicyTable:
+    """The table of a policy in any form; see `of_single`."""
+    return value.as_table(problem, of_single(problem, policy, **of_group))
 
 
-def of_single(problem: Problem, policy: Any) -> Any:
+def of_single(problem: Problem, policy: Any, **of_group: Any) -> Any:
     """A policy of a single target, made where it is the name of a baseline.
 
     Raises:
-        UserError: it is one for several targets.
+        UserError: it is one for several targets, or has an option of these.
     """
+    if of_group:
+        raise UserError(f"{min(of_group)}: an option of several targets, expected none with one")
     if isinstance(policy, Rule):
         raise UserError(
             f"policy: for {len(policy.group)} targets, expected one for a single target"
