@@ -233,16 +233,6 @@ class VerifyConfig(WholeEpisodesConfig):
     any_number = True
     tolerance: float = option("deviation that still counts as equal", unit="reward", gt=0, lt=1)
 
-    def check(self, key: str, root: Any) -> None:
-        """The theorems are on sensors of one cell."""
-        super().check(key, root)
-        if self.sensor.covers:
-            raise refuse(
-                "sensor",
-                self.sensor.name,
-                "perfect or miss; the theorems are on sensors of one cell",
-            )
-
 
 class ReplayConfig(CommandConfig):
     """Look at logged episodes, prove them, rebuild a damaged log; with file= alone, list the episodes."""

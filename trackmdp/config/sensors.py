@@ -110,12 +110,9 @@ class SensorConfig(ChoiceConfig):
     def _check_solver(self, key: str, root: Any) -> None:
         """Refuse solvers, learners and proofs for sensors of one cell, where each covers several."""
         require_able(root, "knows_footprints", f"with {key}={self.name}")
-        if getattr(root, "verify", False):
-            raise refuse(
-                "verify",
-                True,
-                f"false with {key}={self.name}: the theorems are on sensors of one cell",
-            )
+        if getattr(root, "verify", root.any_number):
+            expected = "perfect or miss: the paper's theorems are on sensors of one cell"
+            raise refuse(key, self.name, expected)
 
 
 @choice("sensor", "perfect", makes="trackmdp.sensing.makers:perfect")

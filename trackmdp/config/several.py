@@ -26,8 +26,6 @@ class TargetsConfig(NodeConfig):
         # Each of these makes a single target's plan depend on more than its own cell and clock.
         with_several = f"with {key}.count={self.count}"
         hides = root.kernel.hides
-        if hides and root.kernel.reveals:
-            raise refuse("kernel.reveals", True, f"false {with_several}")
         if hides and root.cost.budget is not None:
             both = f"null with hidden modes and {key}.count={self.count}"
             raise refuse("cost.budget", root.cost.budget, both)
@@ -42,6 +40,7 @@ class TargetsConfig(NodeConfig):
         united = (hides or not root.kernel.is_motion) and not joint and root.cost.budget is None
         own = root.task.memory if united else "cell"
         for place, value, expected in (
+            ("kernel.reveals", hides and root.kernel.reveals, False),
             ("task.memory", root.task.memory, own),
             ("cost.mean_budget", getattr(root.cost, "mean_budget", None), None),
             ("verify", getattr(root, "verify", False), False),

@@ -55,7 +55,12 @@ def evaluate_group(
         raise UserError(f"width={width}: expected a number > 0")
     group = rule.group
     if group.recorded is not None:
-        found = _totals(rule, _every_group(rule), 0)
+        # torch is loaded where targets are moved along tracks
+        from trackmdp.environment.group_paths import GroupPaths, Walks
+
+        # All groups of held-out tracks, of which each is an episode.
+        paths = GroupPaths(group, held_out=True)
+        found = _totals(rule, Walks(paths, paths.every()), 0)
         units = "group", " of held-out tracks"
         return GroupEvaluation(found, False, float(found[:, 5].mean()), None, units)
     exact_steps = group.expected_steps, (group.target_steps, known_mean(rule))
@@ -149,15 +154,6 @@ class _Drawn:
     def ended(self) -> BoolArray:
         """See `Moving`."""
         return ~np.any(self.inside, axis=1)
-
-
-def _every_group(rule: Rule) -> Moving:
-    """All groups of held-out tracks, of which each is an episode."""
-    # torch is loaded where targets are moved along tracks
-    from trackmdp.environment.group_paths import GroupPaths, Walks
-
-    paths = GroupPaths(rule.group, held_out=True)
-    return Walks(paths, paths.every())
 
 
 def _totals(rule: Rule, targets: Moving, seed: int) -> Array:
