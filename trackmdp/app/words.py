@@ -206,6 +206,10 @@ def _check_value(override: Override, known: dict[str, Option]) -> None:
     # Hydra's own options have no schema of ours; `group@package` moves a choice to a place that is not known here.
     if key.split(".")[0] == "hydra" or "@" in key:
         return
+    if inner := [name for name in known if name.startswith(f"{key}.")]:
+        raise UserError(
+            f"{override.input_line}: expected {inner[0]}=value (known: {', '.join(inner)})"
+        )
     # Every option exists already: `+` would add a second meaning, `~` would leave a hole in the typed config.
     if key in known and (override.is_delete() or override.is_add()):
         raise UserError(f"{override.input_line}: expected {key}=value, without + or ~")
