@@ -32,11 +32,22 @@ from trackmdp.world.problem import Problem
 
 @overload
 def simulate(
-    problem: Problem, policy: PolicyLike | Playback, episodes: int, **options: Any
+    problem: Problem,
+    policy: PolicyLike | Playback,
+    episodes: int,
+    *,
+    seed: int = ...,
+    names: Sequence[str | int] = ...,
 ) -> Episodes: ...
 @overload
 def simulate(
-    problem: Group, policy: PolicyLike | Rule, episodes: int, **options: Any
+    problem: Group,
+    policy: PolicyLike | Rule,
+    episodes: int,
+    *,
+    seed: int = ...,
+    names: Sequence[str | int] = ...,
+    merge: str | None = ...,
 ) -> GroupEpisodes: ...
 
 

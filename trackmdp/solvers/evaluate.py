@@ -27,7 +27,14 @@ def evaluate(
     problem: Problem, policy: PolicyLike | Array | BoolArray, *, false_alarm: float = ...
 ) -> Evaluation: ...
 @overload
-def evaluate(problem: Group, policy: PolicyLike, **of_group: Any) -> GroupEvaluation: ...
+def evaluate(
+    problem: Group,
+    policy: PolicyLike,
+    *,
+    merge: str | None = ...,
+    width: float = ...,
+    seed: int = ...,
+) -> GroupEvaluation: ...
 
 
 def evaluate(

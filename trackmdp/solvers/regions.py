@@ -42,7 +42,7 @@ from trackmdp.solvers.partition import (
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.value import value_of
 from trackmdp.solvers.walk import Step
-from trackmdp.solvers.workers import Crew, Made
+from trackmdp.solvers.workers import Crew, Made, in_turn
 from trackmdp.world.model import World
 
 ROOM, SMALLEST_SIDE, LARGEST_SIDE = 2**28, 32, 128
@@ -137,7 +137,7 @@ def _whole_bytes(world: World) -> int:
     """About the memory, Python included, for the whole grid: bounds, policies, their systems.
 
     The most that is held at once is the prediction of the policy that senses least, the clocked one, while it is
-    valued: some 200 bytes an entry, measured on 160 x 160 cells at T_max 1 to 3 and c = .16 and .22.
+    made: some 200 bytes an entry, measured on 160 x 160 cells at T_max 1 to 3 and c = .16 and .22.
     """
     moves = world.kernel.nnz / world.num_cells
     return int(
@@ -217,7 +217,9 @@ def improved(
     return PolicyTable.from_sensed(world, end_to_end(found))
 
 
-def settled(world: World, policy: PolicyTable, side: int, rounds: int, run: Crew) -> PolicyTable:
+def settled(
+    world: World, policy: PolicyTable, side: int, rounds: int, run: Crew = in_turn
+) -> PolicyTable:
     """The policy after at most `rounds` of `improved`, each done by `run`, fewer where no value grows.
 
     Blocks that planned without each other's values leave plans that none of them would change: .006 per step at
