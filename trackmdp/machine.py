@@ -120,16 +120,12 @@ def make_device(name: torch.device | str, key: str = "device") -> torch.device:
     try:
         device = torch.device(name)
         if device.type != "cuda":
-            torch.zeros(1, device=device).cpu()  # not there: `mps`, or without numbers: `meta`
+            torch.empty(0, device=device)  # raises where there is none, as `mps` but on a Mac
             return device
         if (device.index or 0) < count:
             return device
-    except (
-        AssertionError,
-        RuntimeError,
-        TypeError,
-    ):  # no name of a device, or an index that is no C integer
-        pass
+    except (AssertionError, RuntimeError, TypeError):
+        pass  # no name of a device, an index that is no C integer, or PyTorch was built without it
     raise UserError(
         f"{key}={name}: no such device here ({count} CUDA devices found); use cpu or auto"
     )

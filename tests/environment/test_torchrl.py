@@ -279,7 +279,7 @@ def test_a_batch_size_that_is_none_is_named(wrong: Any) -> None:
     ("wrong", "message"),
     [
         (lambda: TrackEnv(small_world(), device="x"), "device=x: no such device here"),
-        (lambda: TrackEnv(small_world(), device="meta"), "device=meta: no such device here"),
+        (lambda: TrackEnv(small_world(), device="vulkan"), "device=vulkan: no such device here"),
         (lambda: TrackEnv(small_world()).to("x"), "device=x: no such device here"),
         (lambda: TrackEnv(small_world(), seed=-1), "seed=-1: expected an integer >= 0"),
         (lambda: TrackEnv(small_world()).set_seed(-1), "seed=-1: expected an integer >= 0"),
