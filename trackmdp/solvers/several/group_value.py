@@ -33,8 +33,8 @@ _AT_ONCE = 2**13
 _MOST = 2**17
 """Episodes, at most."""
 _MOST_ON = 2**27
-"""Sensors on in all of them together, at most about so many, which takes minutes: an untrained policy that has thousands
-on in a step would otherwise be simulated for hours, to a width that says nothing about it."""
+"""Sensors on in all of them together, at most about so many, which takes minutes: a policy that has thousands on in a
+step would otherwise be simulated for hours, to a width that says nothing about it."""
 
 
 def evaluate_group(
