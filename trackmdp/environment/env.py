@@ -103,7 +103,7 @@ class TrackEnv(EnvBase):
         super().__init__(
             device=make_device(device), batch_size=_shape(batch_size), allow_done_after_reset=True
         )
-        task: Task = world.task
+        task: Task = world.task if isinstance(world, Group) else world
         self._world = world
         self.num_envs, self.max_steps = self.batch_size.numel(), task.max_steps
         self.num_cells, self.num_sensors = task.num_cells, task.num_sensors

@@ -12,6 +12,7 @@ from trackmdp.environment.group_dynamics import GroupDynamics
 from trackmdp.environment.group_paths import GroupPaths, group_members
 from trackmdp.environment.paths import path_sampler
 from trackmdp.environment.targets import RecordedTargets, Targets
+from trackmdp.sensing.task import Task
 from trackmdp.world.group import Group
 from trackmdp.world.problem import Problem
 
@@ -37,7 +38,8 @@ class Tracking:
     dynamics: Dynamics | GroupDynamics
 
     def __init__(self, problem: Problem | Group, count: int, device: torch.device) -> None:
-        self.device, task, self.each = device, problem.task, len(problem.targets) or 1
+        task: Task = problem.task if isinstance(problem, Group) else problem
+        self.device, self.each = device, len(problem.targets) or 1
         self._t_max, self._cells = task.t_max, torch.arange(task.num_cells, device=device)
         missed = not (task.perfect and task.safe)
         if isinstance(problem, Group):
