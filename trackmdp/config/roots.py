@@ -231,6 +231,8 @@ class VerifyConfig(WholeEpisodesConfig):
     """Check the paper's theorems on a world."""
 
     any_number = True
+    verify = True
+    """As of `solve verify=true`: the same worlds are refused."""
     tolerance: float = option("deviation that still counts as equal", unit="reward", gt=0, lt=1)
 
 

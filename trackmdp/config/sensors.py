@@ -110,7 +110,7 @@ class SensorConfig(ChoiceConfig):
     def _check_solver(self, key: str, root: Any) -> None:
         """Refuse solvers, learners and proofs for sensors of one cell, where each covers several."""
         require_able(root, "knows_footprints", f"with {key}={self.name}")
-        if getattr(root, "verify", root.any_number):
+        if getattr(root, "verify", False):
             expected = "perfect or miss: the paper's theorems are on sensors of one cell"
             raise refuse(key, self.name, expected)
 
