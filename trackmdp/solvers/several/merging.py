@@ -252,26 +252,24 @@ def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str | None = N
     sensors: gains would make another policy of it. Else a budget needs gains.
     """
     kinds, limited = {"gains": Merged, "union": Union}, group.task.limited
-    one_set = all(each.alike for each in tables) and (
-        len({each.sets.indices.tobytes() for each in tables}) == 1
-    )
-    one_set |= all(map(_all_on, tables))
     if merge is None:
         known = group.recorded is None and group.modes == 1
-        merge = "gains" if not one_set and (known or limited) else "union"
+        merge = "gains" if (known or limited) and not _one_set(tables) else "union"
     if merge not in kinds:
         raise UserError(f"merge={merge}: expected gains or union")
     if merge == "gains" and group.modes > 1:
         raise UserError("targets.merge=gains: expected union with hidden modes")
-    if merge == "union" and limited and not one_set:
+    if merge == "union" and limited and not _one_set(tables):
         raise UserError(f"targets.merge=union: expected gains with a budget, {group.task.budget}")
     return kinds[merge](group, tables)
 
 
-def _all_on(table: PolicyTable) -> bool:
-    """Whether every sensor is on that can be chosen, which with a window are others in each state."""
-    sets, every = table.sets, table.all_on(table.task).sets
-    return sets.shape == every.shape and sets.nnz == every.nnz
+def _one_set(tables: Sequence[PolicyTable]) -> bool:
+    """Whether plans have one set in all states, or all sensors that can be chosen, with a window others in each."""
+    if all(each.alike for each in tables):
+        return len({each.sets.indices.tobytes() for each in tables}) == 1
+    pairs = ((each.sets, each.all_on(each.task).sets) for each in tables)
+    return all(sets.shape == every.shape and sets.nnz == every.nnz for sets, every in pairs)
 
 
 def followed(
