@@ -185,9 +185,10 @@ def _of_group(group: Group, rules: Mapping[str, Rule]) -> Comparison:
         found = {name: evaluate_group(rule, episodes=count) for name, rule in rules.items()}
         first, *_ = found.values()
     rows = tuple(
-        Compared(name, {key: getattr(each, key) for key in FIGURES}, less)
+        Compared(
+            name, {key: getattr(each, key) for key in FIGURES}, _spread(each.less(first).aihtr)
+        )
         for name, each in found.items()
-        for less in [each.less(first).aihtr if exact else _spread(each.less(first).aihtr)]
     )
     units = first.units
     if not exact and group.recorded is None:
@@ -197,14 +198,14 @@ def _of_group(group: Group, rules: Mapping[str, Rule]) -> Comparison:
 
 
 def _spread(less: MeanInterval) -> MeanInterval:
-    """A difference without an interval where all units agree: no spread is no estimate of the spread."""
-    if (
-        less.low is None
-        or less.high is None
-        or less.high - less.low > _SAME * max(abs(less.mean), 1.0)
-    ):
+    """A difference without an interval where all units agree: no spread is no estimate of the spread.
+
+    An exact one, of a single unit, stays.
+    """
+    if less.n == 1 or less.low is None or less.high is None:
         return less
-    return replace(less, low=None, high=None)
+    agree = less.high - less.low <= _SAME * max(abs(less.mean), 1.0)
+    return replace(less, low=None, high=None) if agree else less
 
 
 M = TypeVar("M")
