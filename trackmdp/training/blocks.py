@@ -8,6 +8,7 @@ not learned again on resume, and a block that was interrupted goes on from its o
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +34,7 @@ from trackmdp.solvers.partition import (
     sensing_blocks,
 )
 from trackmdp.solvers.workers import crew
-from trackmdp.training.callbacks import Learning, Position
+from trackmdp.training.callbacks import Callback, Learning, Position
 from trackmdp.training.display import make_console
 from trackmdp.training.evaluator import Score
 from trackmdp.training.folders import SUMMARY, finished, read_summary
@@ -53,19 +54,21 @@ def make_trainer(
     config: TrainConfig,
     folder: Path | None,
     console: Console,
-    **of_grid: Any,
+    *,
+    callbacks: Sequence[Callback] = (),
+    nets: Mapping[str, Any] | None = None,
 ) -> Learning:
-    """The trainer of the whole grid, or of its blocks where `partition.block` is set.
-
-    Arguments as for `Trainer`; `of_grid` are its `callbacks` and `nets`.
+    """The trainer of the whole grid, or of its blocks where `partition.block` is set; arguments as for `Trainer`.
 
     Raises:
         UserError: callbacks or networks are given for blocks, or as `Trainer` raises it.
     """
     if config.partition.block is None:
-        return Trainer(problem, config, folder=folder, console=console, **of_grid)
-    if any(of_grid.values()):
-        what = "callbacks" if of_grid["callbacks"] else "actor, critic"
+        return Trainer(
+            problem, config, folder=folder, callbacks=callbacks, console=console, nets=nets
+        )
+    if callbacks or nets:
+        what = "callbacks" if callbacks else "actor, critic"
         raise UserError(
             f"{what}: expected none with partition.block, whose blocks may learn in other processes"
         )
