@@ -39,8 +39,8 @@ def test_bound_and_figures_are_those_of_the_same_sets_without_a_window() -> None
 def test_all_on_unites_the_windows_of_all_targets() -> None:
     group = Group([tm.make_world("random_walk", size=5, cost=0.2, window=1)] * 2)
     assert make_rule(group, [PolicyTable.all_on(group.single)]).name == "union"
-    tracker = tm.simulate(group, "all_on", 1)[0]
-    assert tracker.action[0].sum() <= 18
+    episode = tm.simulate(group, "all_on", 1)[0]
+    assert episode.action[0].sum() <= 18
 
 
 def test_environment_simulation_tracker_and_log_agree(tmp_path: Path) -> None:

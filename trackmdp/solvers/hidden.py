@@ -93,8 +93,7 @@ def solve(
         **of_bound: further options of the bound's proof, by `optimal.solve`.
     """
     began = time.monotonic()
-    both: Any = {"time_limit": time_limit, "tolerance": tolerance}
-    best = optimal.solve(revealing(world), **both, **of_bound)
+    best = optimal.solve(revealing(world), time_limit=time_limit, tolerance=tolerance, **of_bound)
     budget, interrupted = Budget(1, time_limit), best.interrupted  # no node is counted here
     search = Search(world, WHOLE, _watching(on_progress, budget, best, began))
     try:

@@ -60,7 +60,7 @@ class AlongPaths:
         """For each n `[E]`, worth of a report at each entry over a miss, discounted."""
         renewal, value, gains = self.paths.renewal, self.value, list[Array]()
         later = renewal.missed(value)
-        for (report, spent), step in reversed(list(zip(self.acts, renewal.free, strict=False))):
+        for (report, spent), step in reversed(list(zip(self.acts, renewal.free, strict=True))):
             detected = renewal.task.reward + value[step.following]
             gains.insert(0, detected - later)
             gross = step.moves @ (report * detected + (1.0 - report) * later)
