@@ -56,7 +56,7 @@ def best_of_all(group: Group) -> float:
         if np.abs(after - value).max() < 1e-11 or step == group.task.max_steps:
             break
         value = after
-    return float(after[: group.task.num_cells ** len(group)].mean())
+    return float(after[: (group.states // group.hidden) ** len(group)].mean())
 
 
 def check_figures(rule: Rule, best: float, episodes: int) -> None:
@@ -263,7 +263,7 @@ def test_a_sensor_is_on_where_all_gains_together_exceed_its_price() -> None:
     none = Policy.none(world)
     rule, apart = (make_rule(group, [none], merge) for merge in ("gains", "union"))
     seen = Clocks(np.zeros((1, 2), np.int64), np.zeros((1, 2), np.int64), np.ones((1, 2), bool))
-    moved = Beliefs.of(group, seen).moved(group)
+    moved = Beliefs.of(group, seen.present, group.state_of(seen.located)).moved(group)
     value = evaluate(world, none).value
     lost = world.kernel @ (1.0 + value - 1.4)
     gain, any_left = 2 * world.kernel.toarray()[0] * (1 + value - lost), 1 - 0.1**2

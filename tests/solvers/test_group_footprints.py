@@ -89,8 +89,9 @@ def test_a_target_that_is_alone_has_the_sets_of_its_plan(seed: int) -> None:
     covers[~covers.any(axis=1), 0] = True
     world = World(kernel, (1, 8), coverage=covers, cost=rng.uniform(0.1, 0.3, 10), t_max=0)
     rule = make_rule(Group([world]), [tm.solve(world).table])
-    located = rule.start(np.arange(8)[:, None])
-    sets = rule.sets(located, Beliefs.of(rule.group, located).moved(rule.group))
+    group, start = rule.group, np.arange(8)[:, None]
+    located = rule.start(start)
+    sets = rule.sets(located, Beliefs.of(group, located.present, start).moved(group))
     assert np.array_equal(sets, rule.own_sets(located))
 
 
@@ -102,7 +103,9 @@ def test_a_sensor_that_covers_both_targets_is_on_where_neither_alone_pays_for_it
     for rule, count, expected in ((alone, 1, []), (both, 2, [0])):  # .5 at .6, and 1 at .9
         zero = np.zeros((1, count), np.int64)
         seen = Clocks(zero, zero, np.ones((1, count), bool))
-        moved = Beliefs.of(rule.group, seen).moved(rule.group)
+        moved = Beliefs.of(rule.group, seen.present, rule.group.state_of(seen.located)).moved(
+            rule.group
+        )
         assert rule.sets(seen, moved).tolist() == expected
 
 

@@ -17,9 +17,11 @@ from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluate import evaluate, group_rule
+from trackmdp.solvers.several import group_value
 from trackmdp.solvers.several.group_bounds import upper_bound
 from trackmdp.solvers.several.group_tracker import GroupTracker
 from trackmdp.solvers.several.merging import make_rule
+from trackmdp.solvers.several.simulation import group_steps
 from trackmdp.world.group import Group
 from trackmdp.world.model import World
 from trackmdp.world.problem_file import problem_bytes, problem_digest, read_problem
@@ -57,11 +59,17 @@ def test_brute_force_lies_between_the_policies_and_the_bound(more: dict[str, Any
 
 
 @pytest.mark.parametrize(
-    ("turn", "memory"),
-    [(0.0, "cell"), pytest.param(0.2, "cell", marks=pytest.mark.slow), (0.2, "displacement")],
+    ("turn", "memory", "reveals"),
+    [
+        (0.0, "cell", False),
+        pytest.param(0.2, "cell", False, marks=pytest.mark.slow),
+        (0.2, "displacement", False),
+        (0.2, "cell", True),
+        (0.2, "displacement", True),
+    ],
 )
-def test_one_target_is_todays_world(turn: float, memory: str) -> None:
-    world = ring(turn, memory=memory, clip=1, detection=0.8)
+def test_one_target_is_todays_world(turn: float, memory: str, reveals: bool) -> None:
+    world = ring(turn, memory=memory, clip=1, detection=0.8, reveals=reveals)
     for seed in range(4):
         table = random_table(world, seed)
         alone, found = evaluate(world, table).aihtr, evaluate(Group([world]), table, width=0.02)
@@ -71,6 +79,62 @@ def test_one_target_is_todays_world(turn: float, memory: str) -> None:
             assert found.aihtr.low is not None
             half = found.aihtr.mean - found.aihtr.low
             assert abs(found.aihtr.mean - alone) < 2 * half
+
+
+def test_the_best_policy_of_revealed_modes_is_that_of_states(tmp_path: Path) -> None:
+    """The chain over joint states finds a single target's optimum; two targets' union is below theirs."""
+    world = ring(0.2, leave=0.4, cost=0.4, t_max=0, reveals=True)
+    optimum = tm.solve(world)
+    assert optimum.certified
+    assert best_of_all(Group([world])) == pytest.approx(optimum.upper, rel=1e-6)
+    assert evaluate(Group([world]), "none").aihtr.mean == pytest.approx(
+        evaluate(world, "none").aihtr, abs=1e-9
+    )
+    group = Group([world, World.of(world, ring(0.5, 0.5).kernel, modes=2, revealed=2)])
+    solved, best = tm.solve(group), best_of_all(group)
+    played = evaluate(group, solved, width=0.01).aihtr
+    assert played.low is not None
+    assert solved.apart < best <= solved.upper + 1e-9
+    assert played.low < best
+    episodes = tm.simulate(group, solved.policy, 5).complete()
+    with EpisodeReader(groups.write(tmp_path / "a.mcap", episodes, solved.policy)) as reader:
+        assert verify(reader).difference is None
+
+
+@pytest.mark.parametrize("memory", ["cell", "displacement"])
+def test_a_tracker_that_is_shown_modes_does_as_the_simulation(memory: str) -> None:
+    """Plans are those of the states shown, and a detection leaves no doubt of the mode."""
+    world = ring(0.2, 0.1, memory=memory, clip=1, detection=0.7, reveals=True)
+    group = Group([world, World.of(world, ring(0.5, 0.2).kernel, modes=2, revealed=2)])
+    rule, rng = group_rule(group, random_table(world, 1)), np.random.default_rng(0)
+    targets, chosen = group_value._Drawn(group, 1, rng), set()
+    place, mode = group.cell_of(targets.state)[0].tolist(), (targets.state[0] % 2).tolist()
+    tracker = GroupTracker(rule, place, modes=mode)
+    for step in group_steps(rule, targets, lambda *_: rng.random((1, 2)), predicted=True):
+        tracker = GroupTracker.restore(rule, json.loads(json.dumps(tracker.state())))
+        assert tracker.safe == step.late[0]
+        assert tracker.safe or tracker.sensors() == step.on.tolist()
+        seen, mode = step.seen[0], targets.state[0] % 2
+        shown = [
+            [int(each) if hit else None for each, hit in zip(values, seen, strict=True)]
+            for values in (step.cell[0], mode)
+        ]
+        tracker.sensors()
+        tracker.report(shown[0], gone=np.flatnonzero(~step.inside[0]).tolist(), modes=shown[1])
+        np.testing.assert_allclose(tracker.belief()[seen], np.eye(3)[step.cell[0, seen]])
+        np.testing.assert_allclose(
+            [tracker._masses()[k, targets.state[0, k] % 6] for k in np.flatnonzero(seen)], 1.0
+        )
+        chosen.update(mode[seen].tolist())
+    assert chosen == {0, 1}
+    for modes, message in (
+        (None, "mode=None, expected one of 0 ... 1"),
+        ([0, 2], "mode=2: expected"),
+    ):
+        with pytest.raises(UserError, match=message):
+            GroupTracker(rule, [0, 1], modes=modes)
+    with pytest.raises(UserError, match="mode=1, expected none"):
+        GroupTracker(group_rule(Group([ring(0.1)]), "none"), [0], modes=[1])
 
 
 def test_environment_simulation_tracker_and_log_agree(tmp_path: Path) -> None:
@@ -158,13 +222,11 @@ def test_runs_of_different_memories_are_compared_in_the_same_problem(tmp_path: P
 
 
 def test_what_modes_do_not_go_with_is_refused() -> None:
-    for more, message in (
-        ({"revealed": 2}, "revealed=2, expected none with several targets"),
-        ({"budget": 1}, "budget=1 and modes=2, expected none"),
-    ):
-        with pytest.raises(UserError, match=message):
-            Group([ring(0.1, **more)] * 2)
-    with pytest.raises(UserError, match=r"targets\.merge=gains: expected union with hidden modes"):
+    with pytest.raises(UserError, match="budget=1 and modes=2, expected none"):
+        Group([ring(0.1, budget=1)] * 2)
+    with pytest.raises(UserError, match="TrackEnv: a Group whose modes a detection reveals"):
+        tm.TrackEnv(Group([ring(0.1, reveals=True)] * 2))
+    with pytest.raises(UserError, match=r"targets\.merge=gains: expected union with modes"):
         evaluate(Group([ring(0.1)] * 2), "none", merge="gains")
     with pytest.raises(UserError, match=r"task\.memory=displacement: expected cell"):
         tm.train(Group([ring(0.1, memory="displacement")] * 2), "ppo")

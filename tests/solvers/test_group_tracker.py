@@ -21,7 +21,7 @@ def test_a_tracker_follows_targets_as_the_simulation_does() -> None:
     found = solve(group)
     tracker = found.tracker([0, 5])
     seen = Clocks(np.array([[0, 5]]), np.zeros((1, 2), np.int64), np.ones((1, 2), dtype=bool))
-    moved = Beliefs.of(group, seen).moved(group)
+    moved = Beliefs.of(group, seen.present, group.state_of(seen.located)).moved(group)
     assert tracker.sensors() == found.policy.sets(seen, moved).tolist()
     tracker.report([1, 9])
     tracker.sensors()

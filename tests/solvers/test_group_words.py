@@ -30,7 +30,7 @@ from trackmdp.world.model import World
             "grid.window=2: expected null with algo=ppo with targets.count=2",
         ),
         (
-            ["solve", "targets.count=2", "kernel=heading", "kernel.reveals=true"],
+            ["train", "algo=ppo", "targets.count=2", "kernel=heading", "kernel.reveals=true"],
             "kernel.reveals=True: expected false",
         ),
         (

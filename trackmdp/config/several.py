@@ -40,7 +40,7 @@ class TargetsConfig(NodeConfig):
         united = (hides or not root.kernel.is_motion) and not joint and root.cost.budget is None
         own = root.task.memory if united else "cell"
         for place, value, expected in (
-            ("kernel.reveals", hides and root.kernel.reveals, False),
+            ("kernel.reveals", joint and hides and root.kernel.reveals, False),
             ("task.memory", root.task.memory, own),
             ("cost.mean_budget", getattr(root.cost, "mean_budget", None), None),
             ("verify", getattr(root, "verify", False), False),

@@ -78,9 +78,9 @@ class TrackEnv(EnvBase):
         device: device of the tensors.
 
     Raises:
-        UserError: `world` is no world, `batch_size` no shape, `seed` no integer from 0 on, or there is no such
-            `device`; in `step`, an action has another shape, other values or more sensors on than the budget, or
-            there was no reset before.
+        UserError: `world` is no world, or several targets whose modes a detection reveals; `batch_size` is no shape,
+            `seed` no integer from 0 on, or there is no such `device`; in `step`, an action has another shape, other
+            values or more sensors on than the budget, or there was no reset before.
 
     Example:
         >>> from trackmdp import TrackEnv, make_world
@@ -103,6 +103,10 @@ class TrackEnv(EnvBase):
         super().__init__(
             device=make_device(device), batch_size=_shape(batch_size), allow_done_after_reset=True
         )
+        if isinstance(world, Group) and world.hidden < world.modes:
+            raise UserError(
+                "TrackEnv: a Group whose modes a detection reveals, expected hidden ones"
+            )
         task: Task = world.task if isinstance(world, Group) else world
         self._world = world
         self.num_envs, self.max_steps = self.batch_size.numel(), task.max_steps

@@ -39,8 +39,7 @@ class Group(Carded):
             alone; see `of_tracks`. A policy of one of them may have a memory, the worlds have none.
 
     Raises:
-        UserError: they differ in more than the motion, or have modes that a detection reveals or that a budget goes
-            with, or a memory without modes.
+        UserError: they differ in more than the motion, or have modes and a budget, or a memory without modes.
     """
 
     worlds: Sequence[World]
@@ -53,7 +52,6 @@ class Group(Carded):
             raise UserError(f"Group: expected a list of 1 to {MOST_TARGETS:,} times a World")
         for number, world in enumerate(worlds):
             of_one = {
-                f"revealed={world.revealed}": world.revealed > 1,
                 f"budget={world.budget} and modes={world.modes}": world.modes > 1 and world.limited,
                 f"task.memory={world.memory}": world.memory != "cell" and world.modes == 1,
             }
@@ -100,8 +98,13 @@ class Group(Carded):
 
     @property
     def modes(self) -> int:
-        """H, modes of each target, which are hidden."""
+        """H, modes of each target."""
         return self.worlds[0].modes
+
+    @property
+    def hidden(self) -> int:
+        """Modes between which a detection leaves open: H, or 1 where it reveals the mode."""
+        return self.modes // self.worlds[0].revealed
 
     @property
     def states(self) -> int:
@@ -111,6 +114,10 @@ class Group(Carded):
     def cell_of(self, state: IndexArray) -> IndexArray:
         """Cells of states of `kernel`, in their shape."""
         return state % self.states // self.modes
+
+    def state_of(self, cells: IndexArray, modes: IndexArray | int = 0) -> IndexArray:
+        """`[*E, K]` states of `kernel`, of targets in `cells` and `modes`."""
+        return self.kind * self.states + cells * self.modes + modes
 
     @property
     def targets(self) -> tuple[int, ...]:

@@ -71,17 +71,16 @@ class Beliefs:
         return cls(nothing, nothing, np.zeros(0))
 
     @classmethod
-    def of(cls, group: Group, clocks: Clocks) -> Beliefs:
-        """At the start, where the targets that are there are located."""
-        rows = np.flatnonzero(clocks.present)
-        return cls.found(group, rows, clocks.located.ravel()[rows])
+    def of(cls, group: Group, present: BoolArray, state: IndexArray) -> Beliefs:
+        """At the start, where the targets that are `present` `[E, K]` are located in their `state` `[E, K]`."""
+        rows = np.flatnonzero(present)
+        return cls.found(group, rows, state.ravel()[rows])
 
     @classmethod
-    def found(cls, group: Group, rows: IndexArray, cells: IndexArray) -> Beliefs:
-        """Targets located in `cells`, in any of their modes alike."""
-        modes = group.modes
-        first = group.kind[rows % len(group)] * group.states + cells * modes
-        states = (first[:, None] + np.arange(modes)).ravel()
+    def found(cls, group: Group, rows: IndexArray, state: IndexArray) -> Beliefs:
+        """Targets located in their `state`: in its cell, in any of the modes that are hidden alike."""
+        modes = group.hidden
+        states = ((state // modes * modes)[:, None] + np.arange(modes)).ravel()
         return cls(np.repeat(rows, modes), states, np.full(len(states), 1.0 / modes))
 
     @classmethod
@@ -89,9 +88,10 @@ class Beliefs:
         """From the sets of the steps since each detection, in which no safe action has missed."""
         assert clocks.history is not None
         misses, beliefs = np.where(clocks.present, clocks.misses, -1).ravel(), cls.none()
+        state = group.state_of(clocks.located).ravel()
         for back in range(group.task.t_max, -1, -1):
             rows = np.flatnonzero(misses == back)
-            beliefs = beliefs.joined(cls.found(group, rows, clocks.located.ravel()[rows]))
+            beliefs = beliefs.joined(cls.found(group, rows, state[rows]))
             if back:  # the step that was `back` steps ago, the latest one being 1
                 moved, on = beliefs.moved(group), np.flatnonzero(clocks.history[:, back - 1])
                 episode, cell = moved.row // len(group), group.cell_of(moved.state)
@@ -99,17 +99,17 @@ class Beliefs:
                 beliefs = moved.given(misses >= back, chance, misses.size)
         return beliefs
 
-    def seen(self, group: Group, rows: IndexArray, cells: IndexArray) -> Beliefs:
-        """The targets `rows` of a step's `moved` beliefs, located in `cells`.
+    def seen(self, group: Group, rows: IndexArray, state: IndexArray) -> Beliefs:
+        """The targets `rows` of a step's `moved` beliefs, located in their `state`.
 
-        What is known of their modes is kept, but where no move known leads to the cell.
+        What is known of hidden modes is kept, but where no move known leads to the cell.
         """
-        anew = Beliefs.found(group, rows, cells)
-        if group.modes == 1:
+        anew = Beliefs.found(group, rows, state)
+        if group.hidden == 1:
             return anew
         place, known = among(rows, self.row)
         here = np.flatnonzero(known)
-        here = here[group.cell_of(self.state[here]) == cells[place[here]]]
+        here = here[self.state[here] // group.modes == (state // group.modes)[place[here]]]
         row, mass = self.row[here], self.mass[here]
         total = per_row(row, mass, int(rows.max(initial=-1)) + 1)
         lost = total[anew.row] == 0

@@ -35,8 +35,8 @@ def joint_chain(rule: Rule) -> Array | None:
     None where there are more joint states, or the policy remembers more than beliefs.
     """
     group = rule.group
-    many = group.task.num_cells ** len(group) > MOST_STATES
-    if many or rule.keys.order or rule.reads_history:
+    starts = (group.states // group.hidden) ** len(group)
+    if starts > MOST_STATES or rule.keyed or rule.reads_history:
         return None
 
     def choices(joint: Joint) -> list[IndexArray]:
@@ -55,7 +55,6 @@ def joint_chain(rule: Rule) -> Array | None:
         found = sparse.linalg.spsolve(sparse.csc_array(system), chain.totals)
     else:
         found = summed_over(chain.moves, chain.totals, group.task.max_steps)
-    starts = group.task.num_cells ** len(group)
     return np.asarray(found[:starts].mean(axis=0, keepdims=True))
 
 
@@ -71,11 +70,11 @@ def explored(
         choices: sets of sensors, of which each is followed.
         most: states.
     """
-    cells, modes = range(group.task.num_cells), range(group.modes)
+    modes = group.hidden
 
-    def located(kind: int, cell: int) -> Known:
-        first = kind * group.states + cell * group.modes
-        return cell, 0, tuple((first + mode, 1.0 / group.modes) for mode in modes)
+    def located(state: int) -> Known:
+        known = tuple((state + mode, 1.0 / modes) for mode in range(modes))
+        return state % group.states // group.modes, 0, known
 
     def followed(joint: Joint) -> Iterator[tuple[Array, dict[Joint, float]]]:
         forced = any(each and each[1] > group.task.t_max for each in joint)
@@ -87,7 +86,10 @@ def explored(
                     moves[after] += chance
             yield total, moves
 
-    each = [[located(kind, cell) for cell in cells] for kind in group.targets]
+    firsts = [
+        range(kind * group.states, (kind + 1) * group.states, modes) for kind in group.targets
+    ]
+    each = [[located(state) for state in states] for states in firsts]
     return reached(list(itertools.product(*each)), followed, most)
 
 
@@ -116,11 +118,12 @@ def _outcomes(group: Group, known: Known, on: IndexArray, forced: bool) -> list[
     cells = group.cell_of(moved.state)
     sees = task.safe_detection[cells] if forced else report_chance(task, on, 0 * cells, cells)
     found: list[Outcome] = []
-    for cell in np.unique(cells).tolist():
-        here = cells == cell
+    shown = moved.state // group.hidden  # the cell, or the state where a detection reveals the mode
+    for place in np.unique(shown):
+        here = shown == place
         total, known_there = _normal(moved.state[here], moved.mass[here] * sees[here])
         if total > 0:
-            found.append((total, True, (cell, 0, known_there)))
+            found.append((total, True, (int(cells[here][0]), 0, known_there)))
     total, left = _normal(moved.state, moved.mass * (1.0 - sees))
     if total > 1e-15:
         found.append((total, False, (located, min(misses + 1, task.t_max + 1), left)))

@@ -23,9 +23,11 @@ class GroupTracker(Following):
         policy: for several targets: `GroupSolution.policy` or `Run.rule`.
         cells: of the targets, by their numbers.
         at: their positions in place of cells, as of `Tracker`.
+        modes: of the targets there, where a detection reveals them.
 
     Raises:
-        UserError: no such policy, or other cells or positions than one of the grid for each target.
+        UserError: no such policy; other cells or positions than one of the grid for each target; or modes are missing,
+            or given where detections do not reveal them.
 
     Example:
         >>> from trackmdp.solvers.solve import solve
@@ -44,6 +46,7 @@ class GroupTracker(Following):
         cells: Sequence[int] | None = None,
         *,
         at: Sequence[tuple[float, float]] | None = None,
+        modes: Sequence[int] | None = None,
     ) -> None:
         if not isinstance(policy, Rule):
             raise UserError(
@@ -51,9 +54,10 @@ class GroupTracker(Following):
             )
         self._policy, self._group, self._task = policy, policy.group, policy.task
         self._first = self._group.kind * self._group.states  # `[K]`, the first states
-        found = self._given("tracker", cells, at)
-        self._clocks = policy.start(np.array([[self._cell("tracker", cell) for cell in found]]))
-        self._beliefs = Beliefs.of(self._group, self._clocks)
+        found = [self._cell("tracker", cell) for cell in self._given("tracker", cells, at)]
+        state = self._state("tracker", found, modes)
+        self._clocks = policy.start(state)
+        self._beliefs = Beliefs.of(self._group, self._clocks.present, state)
 
     def __repr__(self) -> str:
         return f"GroupTracker(cells={self.cells}, misses={self.misses}, safe={self.safe})"
@@ -95,6 +99,19 @@ class GroupTracker(Following):
     def _cell(self, call: str, cell: Any) -> int:
         return whole_number(f"{call}: cell", cell, 0, self._task.num_cells - 1)
 
+    def _state(self, call: str, cells: Sequence[int | None], modes: Any) -> IndexArray:
+        """`[1, K]` states of targets located in `cells`, the first of a cell's where its modes are hidden."""
+        count, found = self._group.modes // self._group.hidden, list[int]()
+        given = [None] * len(cells) if modes is None else _each(modes, f"{call}: modes", len(cells))
+        for cell, mode in zip(cells, given, strict=True):
+            shown = count > 1 and cell is not None
+            if (mode is not None) != shown:
+                wanted = f"one of 0 ... {count - 1}" if shown else "none"
+                raise UserError(f"{call}: mode={mode}, expected {wanted}")
+            found.append(whole_number(f"{call}: mode", mode, 0, count - 1) if shown else 0)
+        places = [0 if cell is None else cell for cell in cells]
+        return self._group.state_of(np.array([places]), np.array([found]))
+
     def _chosen(self) -> list[int]:
         """See `Following`; none once all targets have left."""
         if not self._clocks.present.any():
@@ -122,6 +139,7 @@ class GroupTracker(Following):
         gone: Iterable[int] = (),
         *,
         at: Sequence[tuple[float, float] | None] | None = None,
+        modes: Sequence[int | None] | None = None,
     ) -> None:
         """Go on by one step.
 
@@ -129,10 +147,12 @@ class GroupTracker(Following):
             cells: for each target the cell in which it was detected, or None.
             gone: numbers of targets that have left the grid in this step.
             at: positions in place of cells.
+            modes: for each target the mode in which it was detected, where a detection reveals it.
 
         Raises:
             UserError: no `sensors()` before; a cell is none of the grid or seen by no sensor that is on, a target that
-                has left is detected, or one is missed that cannot be; or `gone` has no numbers of targets.
+                has left is detected, or one is missed that cannot be; `gone` has no numbers of targets; or modes are
+                missing, or given where detections do not reveal them.
         """
         self._check_asked()
         before, count = self._clocks, len(self._group)
@@ -144,12 +164,13 @@ class GroupTracker(Following):
         seen = np.array([cell is not None for cell in cells])
         if (seen & ~present).any():
             raise UserError(f"report({cells}): expected None for a target that has left")
-        place = np.array([0 if cell is None else self._cell("report", cell) for cell in cells])
-        for cell in place[seen]:
-            self._check_seen("report", int(cell))
+        for cell in cells:
+            if cell is not None:
+                self._check_seen("report", self._cell("report", cell))
+        state = self._state("report", cells, modes)
         on, moved = np.array(self._on, np.int64), self._beliefs.moved(self._group)
         reports = present[None], seen[None]
-        clocks, beliefs = followed(self._policy, before, moved, on, place[None], reports)
+        clocks, beliefs = followed(self._policy, before, moved, on, state, reports)
         lost = np.setdiff1d(np.flatnonzero(present & ~seen), beliefs.row)
         if len(lost) and self._group.recorded is None:  # a track may make moves that no other made
             raise UserError(f"report: target {lost[0]} is missed where it would have been detected")
@@ -176,9 +197,11 @@ class GroupTracker(Following):
         Raises:
             UserError: the state is of another grid, other sensors or other targets, or is no state.
         """
-        tracker = cls(policy, [0] * len(policy.group))
+        group = policy.group
+        modes = None if group.hidden == group.modes else [0] * len(group)
+        tracker = cls(policy, [0] * len(group), modes=modes)
         tracker._check_state(state)
-        task, count, past = policy.task, len(policy.group), tracker._clocks.history
+        task, count, past = policy.task, len(group), tracker._clocks.history
         cells, misses, present, beliefs = (
             _each(state[name], f"state: {name}", count)
             for name in ("cells", "misses", "present", "belief")
@@ -198,10 +221,10 @@ class GroupTracker(Following):
             key = np.array([[whole_number("state: key", each, 0, last) for each in given]])
             if (policy.keys.cell(key[0]) != cells).any():
                 raise UserError(f"state: key={given}: expected keys of the cells {cells}")
-        mass = np.zeros((count, policy.group.states))
+        mass = np.zeros((count, group.states))
         for number, (here, given) in enumerate(zip(present, beliefs, strict=True)):
             if here and given is not None:
-                mass[number] = probabilities(given, policy.group.states)
+                mass[number] = probabilities(given, group.states)
         row, place = np.nonzero(mass)
         tracker._beliefs = Beliefs(row, place + tracker._first[row], mass[row, place])
         shown = np.array([missed]), np.array([present])
@@ -223,9 +246,10 @@ class Followed:
         cells: Sequence[int] | None = None,
         *,
         at: Sequence[tuple[float, float]] | None = None,
+        modes: Sequence[int] | None = None,
     ) -> GroupTracker:
         """A tracker that follows the targets, located in `cells` or `at` positions, with `rule`; see `GroupTracker`."""
-        return GroupTracker(self.rule, cells, at=at)
+        return GroupTracker(self.rule, cells, at=at, modes=modes)
 
 
 def _each(given: Any, call: str, count: int | None = None) -> list[Any]:

@@ -97,7 +97,7 @@ class JointRule(Followed, Rule):
         found = []
         for kind in range(len(self.group.kinds)):
             alone = np.arange(len(self.group)) == self.group.targets.index(kind)
-            start = self.start(np.repeat(np.arange(self.cells)[:, None], len(self.group), axis=1))
+            start = self.start(self.group.state_of(np.arange(self.cells)[:, None]))
             shown = Clocks(start.located, start.misses, start.present & alone, start.history)
             found.append(sparse.csr_array(self._chosen(shown)))
         return found

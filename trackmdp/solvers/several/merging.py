@@ -84,21 +84,28 @@ class Rule(ABC):
         kinds = group.kinds if known.keys() >= set(group.kinds) else self.group.kinds
         return type(self)(group, [known[kind] for kind in kinds])
 
-    def start(self, located: IndexArray, present: BoolArray | None = None) -> Clocks:
-        """Targets of E episodes located in the cells `[E, K]`: all, or those that are `present` `[E, K]`."""
+    @property
+    def keyed(self) -> bool:
+        """Whether plans know more at a detection than the cell."""
+        return self.keys.num_classes > 1
+
+    def start(self, state: IndexArray, present: BoolArray | None = None) -> Clocks:
+        """Targets of E episodes located in their `state` `[E, K]`: all, or those that are `present` `[E, K]`."""
+        located, mode = self.group.cell_of(state), state % self.group.modes
         history = np.zeros((len(located), self.task.num_choices, self.sensors), bool)
         kept = history if self.reads_history else None
         here = np.ones(located.shape, bool) if present is None else present
         located = np.where(here, located, 0)
-        key = self.keys.start(located) if self.keys.order else None
+        key = self.keys.start(located, mode) if self.keyed else None
         return Clocks(located, np.zeros_like(located), here, kept, key)
 
     def keys_after(self, clocks: Clocks, state: IndexArray, seen: BoolArray) -> IndexArray | None:
         """`[E, K]` keys after a step in which the targets `seen` `[E, K]` were located in `state`, or have entered."""
         if clocks.key is None:
             return None
-        later = self.keys.next(clocks.key, clocks.misses, state)
-        later = np.where(clocks.present, later, self.keys.start(state))
+        place = self.group.cell_of(state), state % self.group.modes
+        later = self.keys.next(clocks.key, clocks.misses, *place)
+        later = np.where(clocks.present, later, self.keys.start(*place))
         return np.where(seen, later, clocks.key)
 
     def first_sets(self) -> list[sparse.csr_array]:
@@ -126,7 +133,7 @@ class Rule(ABC):
         Raises:
             UserError: it reads more than these states hold, or they are of other targets.
         """
-        unseen = "the keys of its plans" if self.keys.order else ""
+        unseen = "the keys of its plans" if self.keyed else ""
         if self.reads_beliefs and not self.task.safe:
             unseen = "the steps in which the safe action missed"
         if unseen:
@@ -258,7 +265,7 @@ def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str | None = N
     if merge not in kinds:
         raise UserError(f"merge={merge}: expected gains or union")
     if merge == "gains" and group.modes > 1:
-        raise UserError("targets.merge=gains: expected union with hidden modes")
+        raise UserError("targets.merge=gains: expected union with modes")
     if merge == "union" and limited and not _one_set(tables):
         raise UserError(f"targets.merge=union: expected gains with a budget, {group.task.budget}")
     return kinds[merge](group, tables)
@@ -273,7 +280,7 @@ def _one_set(tables: Sequence[PolicyTable]) -> bool:
 
 
 def followed(
-    rule: Rule, clocks: Clocks, moved: Beliefs, on: IndexArray, place: IndexArray, report: Reports
+    rule: Rule, clocks: Clocks, moved: Beliefs, on: IndexArray, state: IndexArray, report: Reports
 ) -> tuple[Clocks, Beliefs]:
     """Clocks and beliefs after a step.
 
@@ -282,7 +289,7 @@ def followed(
         clocks: before the step.
         moved: beliefs after the move.
         on: sorted numbers e · S + j of the sensors j that were on in episode e.
-        place: `[E, K]`, cells of the targets after the move.
+        state: `[E, K]`, of the targets after the move; read where they were located.
         report: which targets are in the grid, and which were located.
     """
     task, (present, seen) = rule.task, report
@@ -292,9 +299,9 @@ def followed(
     chance = np.where(late[episode], task.safe_detection[cell], seen_with)
     left = moved.given(missed, chance, missed.size)
     again = np.flatnonzero(seen.ravel())
-    found = left.joined(moved.seen(rule.group, again, place.ravel()[again]))
+    found = left.joined(moved.seen(rule.group, again, state.ravel()[again]))
     # A target that has left keeps no clock; one that the safe action missed is due for the next one.
     misses = np.where(present & ~seen, np.minimum(clocks.misses + 1, task.t_max + 1), 0)
-    located = np.where(seen, place, clocks.located)
-    history, key = clocks.remembered(on, late), rule.keys_after(clocks, place, seen)
+    located = np.where(seen, rule.group.cell_of(state), clocks.located)
+    history, key = clocks.remembered(on, late), rule.keys_after(clocks, state, seen)
     return Clocks(located, misses, present, history, key), found

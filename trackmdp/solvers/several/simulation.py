@@ -84,8 +84,9 @@ def group_steps(
         predicted: whether beliefs are wanted where the policy does not read them.
     """
     task, group, sensors = rule.task, rule.group, rule.sensors
-    clocks = rule.start(group.cell_of(targets.state), targets.inside)
-    beliefs, sure = Beliefs.of(group, clocks), task.perfect and task.safe
+    clocks = rule.start(targets.state, targets.inside)
+    beliefs = Beliefs.of(group, clocks.present, targets.state)
+    sure = task.perfect and task.safe
     for number in itertools.count() if task.max_steps is None else range(task.max_steps):
         if not len(row := np.flatnonzero(clocks.present.any(axis=1))):
             return
@@ -104,5 +105,5 @@ def group_steps(
         step = GroupStep(row, clocks, moved, on, late, cell, inside, seen)
         going = inside & ~targets.ended()[:, None]
         reports = going, (seen | step.entered) & going
-        clocks, beliefs = followed(rule, clocks, moved, on, cell, reports)
+        clocks, beliefs = followed(rule, clocks, moved, on, targets.state, reports)
         yield step
