@@ -72,7 +72,8 @@ def test_one_target_is_todays_world(turn: float, memory: str, reveals: bool) -> 
     world = ring(turn, memory=memory, clip=1, detection=0.8, reveals=reveals)
     for seed in range(4):
         table = random_table(world, seed)
-        alone, found = evaluate(world, table).aihtr, evaluate(Group([world]), table, width=0.02)
+        alone = evaluate(world, table).aihtr
+        found = evaluate(Group([world]), table, merge="union", width=0.02)
         if turn == 0:
             assert found.aihtr.mean == pytest.approx(alone, abs=1e-9)
         else:
@@ -83,19 +84,28 @@ def test_one_target_is_todays_world(turn: float, memory: str, reveals: bool) -> 
 
 def test_the_best_policy_of_revealed_modes_is_that_of_states(tmp_path: Path) -> None:
     """The chain over joint states finds a single target's optimum; two targets' union is below theirs."""
-    world = ring(0.2, leave=0.4, cost=0.4, t_max=0, reveals=True)
+    world = ring(0.2, leave=0.4, cost=0.4, safe_cost=1.3, t_max=0, reveals=True)
     optimum = tm.solve(world)
     assert optimum.certified
     assert best_of_all(Group([world])) == pytest.approx(optimum.upper, rel=1e-6)
-    assert evaluate(Group([world]), "none").aihtr.mean == pytest.approx(
-        evaluate(world, "none").aihtr, abs=1e-9
-    )
+    none = evaluate(Group([world]), tm.Policy.none(world.remembering()))
+    assert none.exact
+    assert none.aihtr.mean == pytest.approx(evaluate(world, "none").aihtr, abs=1e-9)
     group = Group([world, World.of(world, ring(0.5, 0.5).kernel, modes=2, revealed=2)])
     solved, best = tm.solve(group), best_of_all(group)
-    played = evaluate(group, solved, width=0.01).aihtr
+    assert solved.policy.name == "gains"
+    assert solved.lower is not None
+    assert solved.lower <= best <= solved.upper + 1e-9
+    for merge in ("gains", "union"):
+        played = evaluate(group, solved, width=0.01, merge=merge).aihtr
+        assert played.low is not None
+        assert played.high is not None
+        assert played.low < best
+        assert solved.lower < played.high
+    limited = group.but(budget=1)
+    played, best = evaluate(limited, tm.solve(limited), width=0.01).aihtr, best_of_all(limited)
     assert played.low is not None
-    assert solved.apart < best <= solved.upper + 1e-9
-    assert played.low < best
+    assert best - 0.2 < played.low < best
     episodes = tm.simulate(group, solved.policy, 5).complete()
     with EpisodeReader(groups.write(tmp_path / "a.mcap", episodes, solved.policy)) as reader:
         assert verify(reader).difference is None
@@ -104,9 +114,10 @@ def test_the_best_policy_of_revealed_modes_is_that_of_states(tmp_path: Path) -> 
 @pytest.mark.parametrize("memory", ["cell", "displacement"])
 def test_a_tracker_that_is_shown_modes_does_as_the_simulation(memory: str) -> None:
     """Plans are those of the states shown, and a detection leaves no doubt of the mode."""
-    world = ring(0.2, 0.1, memory=memory, clip=1, detection=0.7, reveals=True)
-    group = Group([world, World.of(world, ring(0.5, 0.2).kernel, modes=2, revealed=2)])
+    world = ring(0.2, 0.02, memory=memory, clip=1, detection=0.7, reveals=True)
+    group = Group([world, World.of(world, ring(0.5, 0.02).kernel, modes=2, revealed=2)])
     rule, rng = group_rule(group, random_table(world, 1)), np.random.default_rng(0)
+    assert rule.name == ("gains" if memory == "cell" else "union")
     targets, chosen = group_value._Drawn(group, 1, rng), set()
     place, mode = group.cell_of(targets.state)[0].tolist(), (targets.state[0] % 2).tolist()
     tracker = GroupTracker(rule, place, modes=mode)
@@ -222,11 +233,13 @@ def test_runs_of_different_memories_are_compared_in_the_same_problem(tmp_path: P
 
 
 def test_what_modes_do_not_go_with_is_refused() -> None:
-    with pytest.raises(UserError, match="budget=1 and modes=2, expected none"):
+    with pytest.raises(UserError, match="budget=1 and hidden modes, expected none"):
         Group([ring(0.1, budget=1)] * 2)
     with pytest.raises(UserError, match="TrackEnv: a Group whose modes a detection reveals"):
         tm.TrackEnv(Group([ring(0.1, reveals=True)] * 2))
-    with pytest.raises(UserError, match=r"targets\.merge=gains: expected union with modes"):
+    with pytest.raises(
+        UserError, match=r"targets\.merge=gains: expected union, or plans of cell and"
+    ):
         evaluate(Group([ring(0.1)] * 2), "none", merge="gains")
     with pytest.raises(UserError, match=r"task\.memory=displacement: expected cell"):
         tm.train(Group([ring(0.1, memory="displacement")] * 2), "ppo")

@@ -26,7 +26,7 @@ class TargetsConfig(NodeConfig):
         # Each of these makes a single target's plan depend on more than its own cell and clock.
         with_several = f"with {key}.count={self.count}"
         hides = root.kernel.hides
-        if hides and root.cost.budget is not None:
+        if hides and not root.kernel.reveals and root.cost.budget is not None:
             both = f"null with hidden modes and {key}.count={self.count}"
             raise refuse("cost.budget", root.cost.budget, both)
         if root.sensor.name == "false_alarm":

@@ -258,7 +258,8 @@ def price_at_exit(world: World, policy: PolicyTable) -> float:
     prices.append(np.full(len(events.codes), world.safe_cost))
     exits = [step.totals[:, 5] - step.totals[:, 1] for step in steps]
     paid = (np.stack(prices) * np.stack(exits)).sum(axis=0)
-    return float(RenewalSystem(located, world.size).solve(paid).mean())
+    size = world.size if world.modes == 1 else event_groups(world.motion, events.state)
+    return float(RenewalSystem(located, size).solve(paid).mean())
 
 
 def replay(task: Task, tracks: Tracks, policy: PolicyTable) -> ReplayedTracks:

@@ -39,7 +39,7 @@ class Group(Carded):
             alone; see `of_tracks`. A policy of one of them may have a memory, the worlds have none.
 
     Raises:
-        UserError: they differ in more than the motion, or have modes and a budget, or a memory without modes.
+        UserError: they differ in more than the motion, or have hidden modes and a budget, or a memory without modes.
     """
 
     worlds: Sequence[World]
@@ -52,7 +52,8 @@ class Group(Carded):
             raise UserError(f"Group: expected a list of 1 to {MOST_TARGETS:,} times a World")
         for number, world in enumerate(worlds):
             of_one = {
-                f"budget={world.budget} and modes={world.modes}": world.modes > 1 and world.limited,
+                f"budget={world.budget} and hidden modes": world.limited
+                and world.modes > world.revealed,
                 f"task.memory={world.memory}": world.memory != "cell" and world.modes == 1,
             }
             if name := next(filter(of_one.get, of_one), ""):

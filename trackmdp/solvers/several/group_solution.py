@@ -61,7 +61,7 @@ class GroupSolution(Followed, Carded):
         not, or modes are hidden.
         """
         task = self.group.task
-        if self.group.modes > 1 or not (sensors_suffice(task) and task.safe):
+        if self.group.hidden > 1 or not (sensors_suffice(task) and task.safe):
             return None
         kinds = zip(self.group.kinds, self.tables, strict=True)
         exits = [price_at_exit(*each) if len(self.group) > 1 else 0.0 for each in kinds]

@@ -197,10 +197,15 @@ class Merged(Rule):
     name = "gains"
     reads_beliefs = True
 
+    @property
+    def remembers(self) -> bool:
+        """See `Rule`; the mode that a detection reveals, so that keys are states."""
+        return self.group.hidden < self.group.modes
+
     @cached_property
     def _plans(self) -> tuple[Array, list[tuple[IndexArray, Array]]]:
         """`[Z]` V of all kinds; and for each n sorted numbers located · Z + state with W there."""
-        states = self.group.kernel.shape[0]
+        states, each = self.group.kernel.shape[0], self.group.states
         values = []
         worths = [(list[IndexArray](), list[Array]()) for _ in range(self.task.num_choices)]
         # Plans are those of whole episodes, also where these are cut off.
@@ -210,11 +215,11 @@ class Merged(Rule):
                 policy = Found(renewal, renewal.sets(table))
             except UserError as error:  # the target never exits
                 raise UserError(f"{error}, or max_steps and targets.merge=union") from None
-            # Behind the cells stand those in which the safe action has missed, if it does.
-            values.append(policy.value[: self.cells])
+            # Behind the states stand those in which the safe action has missed, if it does.
+            values.append(policy.value[:each])
             after = policy.plans().after(policy.sets)
             for step, worth, (codes, found) in zip(renewal.free, after, worths, strict=True):
-                located, state = step.rows + kind * self.cells, step.states + kind * self.cells
+                located, state = step.rows + kind * each, step.states + kind * each
                 codes.append(located.astype(np.int64) * states + state)
                 found.append(worth[:, 0])
         return np.concatenate(values), [
@@ -222,7 +227,7 @@ class Merged(Rule):
         ]
 
     def credit(self, located: IndexArray, misses: IndexArray, state: IndexArray) -> Array:
-        """`[L]`, r + V - W of targets in `state`; 0 where only a belief by another motion has them."""
+        """`[L]`, r + V - W of targets in `state`, last `located` in another one; 0 where no own move leads there."""
         value, worths = self._plans
         found, codes = np.zeros(len(state)), located * self.group.kernel.shape[0] + state
         for n, (known, worth) in enumerate(worths):
@@ -237,8 +242,8 @@ class Merged(Rule):
         episodes, targets = seen.present.shape
         free = (seen.misses <= self.task.t_max).ravel()[moved.row]
         row, state = moved.row[free], moved.state[free]
-        located, misses = seen.located.ravel()[row], seen.misses.ravel()[row]
-        located = located + self.group.kind[row % targets] * self.cells
+        located, misses = seen.located if seen.key is None else seen.key, seen.misses.ravel()[row]
+        located = located.ravel()[row] + self.group.kind[row % targets] * self.group.states
         cell, episode = self.group.cell_of(state), row // targets
         gain = moved.mass[free] * self.credit(located, misses, state)
         inside = per_row(moved.row, moved.mass, episodes * targets)
@@ -259,13 +264,15 @@ def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str | None = N
     sensors: gains would make another policy of it. Else a budget needs gains.
     """
     kinds, limited = {"gains": Merged, "union": Union}, group.task.limited
+    plans = [each.task for each in tables]
+    of_states = all(each.order == 0 and each.revealed == group.modes for each in plans)
     if merge is None:
-        known = group.recorded is None and group.modes == 1
+        known = group.recorded is None and of_states
         merge = "gains" if (known or limited) and not _one_set(tables) else "union"
     if merge not in kinds:
         raise UserError(f"merge={merge}: expected gains or union")
-    if merge == "gains" and group.modes > 1:
-        raise UserError("targets.merge=gains: expected union with modes")
+    if merge == "gains" and group.modes > 1 and not of_states:
+        raise UserError("targets.merge=gains: expected union, or plans of cell and revealed mode")
     if merge == "union" and limited and not _one_set(tables):
         raise UserError(f"targets.merge=union: expected gains with a budget, {group.task.budget}")
     return kinds[merge](group, tables)
