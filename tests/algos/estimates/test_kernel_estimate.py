@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import tracemalloc
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -115,11 +116,15 @@ def test_every_round_makes_what_was_seen_more_likely() -> None:
 
 
 def test_paths_taken_part_by_part_give_the_same_moves(monkeypatch: pytest.MonkeyPatch) -> None:
-    paths, kernel = paths_of(simulated(200, 0)), sparse.csr_array(np.full((4, 5), 0.2))
-    whole = expected_moves(kernel, paths, np.ones(200)).toarray()
-    monkeypatch.setattr(censored, "_ENTRIES", 30)
-    apart = expected_moves(kernel, paths, np.ones(200)).toarray()
-    np.testing.assert_allclose(apart, whole, rtol=1e-12)
+    """With masses that are sparse or dense, also where a path's end is an exit or not known."""
+    rng, paths = np.random.default_rng(0), paths_of(simulated(200, 0))
+    kernel = rng.random((4, 5))
+    kernel[2, 1] = 0.0
+    given = sparse.csr_array(kernel), replace(paths, end=rng.integers(6, size=200)), rng.random(200)
+    whole = expected_moves(*given).toarray()
+    for name, number in (("_FULL_ENTRIES", 30), ("_FULL", 2.0), ("_ENTRIES", 30)):
+        monkeypatch.setattr(censored, name, number)
+        np.testing.assert_allclose(expected_moves(*given).toarray(), whole, rtol=1e-12)
 
 
 def test_paths_that_exit_need_memory_for_the_cells_where_they_may_be_alone() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
@@ -10,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays.entries import block_rows, ones_at, row_index
+from trackmdp.arrays.entries import block_rows, ones_at, row_index, summing
 from trackmdp.arrays.types import Array, BoolArray, IndexArray
 
 _AT_ONCE = 2**14
@@ -19,6 +20,9 @@ _ENTRIES = 2**23
 """Cells where paths may be, and pairs of such cells, that are worked on at once: some 100 MB an array."""
 _SAMPLE = 64
 """Paths from which the cells of all others are reckoned."""
+_FULL, _FULL_ENTRIES = 1 / 8, 2**20
+"""Share of moves that are possible from which masses are dense, as targets may soon be in most cells; and numbers of
+such a mass."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,8 @@ def expected_moves(
     With f_t the undetected mass and l_t the likelihood of the later observations, the move i -> j at step t of
     a path is made with probability f_t(i) P_ij l_{t+1}(j) / (likelihood of the path); P_ij is multiplied in at the end.
     """
+    if kernel.nnz > _FULL * math.prod(kernel.shape):
+        return kernel.multiply(_dense_pairs(kernel.toarray(), paths, copies))
     m, moves, backward, leave = kernel.shape[0], *_directions(kernel)
     # Sums at the stored entries of the kernel alone: all other moves have probability 0.
     possible, made = _support(kernel), sparse.csr_array(kernel.shape)
@@ -116,6 +122,32 @@ def expected_moves(
             if t > 0:  # no move comes before the first one
                 later = (later @ backward[:m]).multiply(_support(forward[t]))
     return made.multiply(kernel)
+
+
+def _dense_pairs(kernel: Array, paths: ObservedPaths, copies: Array) -> Array:
+    """`[M, M + 1]` sums of f_t(i) l_{t+1}(j) / (likelihood of the path), as of `expected_moves`."""
+    m, made, count = len(kernel), np.zeros(kernel.shape), max(1, _FULL_ENTRIES // len(kernel))
+    moves = np.ascontiguousarray(kernel[:, :m])
+    # 1 at all cells if the end is unknown
+    ends = np.concatenate([kernel.T, np.ones((1, m))])
+    for n in np.unique(paths.misses):
+        whole = np.flatnonzero(paths.misses == n)
+        for begin in range(0, len(whole), count):
+            some = paths.pick(part := whole[begin : begin + count])
+            missed = [1.0 - sensed.toarray() for sensed in some.sets(n)]
+            start = summing(some.start, m)
+            forward: list[Any] = [start.T]
+            for each in missed:
+                forward.append((forward[-1] @ moves) * each)
+            later = ends[some.end]
+            weight = copies[part] / np.maximum((forward[n] * later).sum(axis=1), 1e-300)
+            made += (summing(some.end, m + 2) @ (forward[n] * weight[:, None]))[: m + 1].T
+            for t in range(n - 1, -1, -1):
+                later = missed[t] * later
+                made[:, :m] += forward[t].T @ (weight[:, None] * later)
+                if t > 0:  # no move comes before the first one
+                    later = later @ moves.T
+    return made
 
 
 def _pairs(
