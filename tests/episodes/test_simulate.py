@@ -363,6 +363,8 @@ def test_all_steps_are_one_tensordict() -> None:
 def test_a_safe_action_that_misses_is_told_so() -> None:
     world = tm.make_world("random_walk", size=3, t_max=0, safe_detection=0.3)
     (episode,) = simulate(world, Policy.none(world), 1)
+    # Without T_max it is not known which sets the safe action replaced.
+    assert "sensors per step" not in dict(episode.card().facts)
     forced, inside = episode.misses > 0, episode.target < 9
     for seen, word in ((True, "located"), (False, "missed")):
         (t, *_) = np.flatnonzero(forced & inside & (episode.located == seen))

@@ -123,11 +123,13 @@ def test_what_is_drawn_is_what_was_logged(
     every = [messages(file, topic) for topic in LAYERS]
     assert [each[0]["pose"]["position"]["z"] for each in every] == [0, 0.01, 0.02]
     steps = [(episode, t) for episode in episodes for t in range(len(episode))]
-    for (episode, t), *layers in zip(steps, *every, strict=True):
+    counts = [each["n_active"] for each in messages(file, "/step")]
+    for (episode, t), count, *layers in zip(steps, counts, *every, strict=True):
         shown = {name: cells for layer in layers for name, cells in drawn(layer, WALK.size).items()}
         assert np.array_equal(shown["belief"], episode.belief[t])  # type: ignore[index]
         assert np.array_equal(shown["policy"], episode.probability[t])  # type: ignore[index]
-        assert np.array_equal(shown["active"], episode.action[t])
+        on = episode.action[t] & ~episode.forced(WALK.t_max)[t]
+        assert np.array_equal(shown["active"], on) and count == on.sum()
         assert np.flatnonzero(shown["target"]).tolist() == [
             each for each in [episode.target[t]] if each < 12
         ]

@@ -132,7 +132,7 @@ class Episode(Carded):
         return TensorDict({**current, "action": action, "next": following}, [len(self)])
 
     def card(self) -> Card:
-        """Length, return, detections and end."""
+        """Length, return, detections and end; sensors are counted where T_max is known (`Episodes.figures`)."""
         who = "all targets" if self.several else "the target"
         end, count = f"{who} exited" if self.terminated else "truncated", int(self.located.sum())
         facts = {"targets": str(len(self.start))} if self.several else {}
@@ -141,7 +141,6 @@ class Episode(Carded):
             facts["start"] = f"cell {self.start}"
         facts["return"] = decimal(float(self.returns[-1]))
         facts["located"] = f"{count:,} times" if self.several else f"in {count:,} steps"
-        facts["sensors per step"] = decimal(float(self.action.sum(1).mean()))
         return Card(f"Episode: number {self.number}, seed {self.seed}", facts)
 
 

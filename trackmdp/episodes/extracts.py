@@ -35,8 +35,8 @@ _LEFT_OUT = {"target_x", "target_y", "first", "last"}
 def write_tables(reader: EpisodeReader, folder: Path, number: int | None = None) -> None:
     """Write `steps.csv` and `episodes.csv` of all episodes, or of one.
 
-    Cells are numbers, -1 for none; `active` holds the numbers of the sensors on, and a column of several targets a
-    number of each, separated by blanks.
+    Cells are numbers, -1 for none; `active` holds the numbers of the sensors chosen, of which none is on where
+    `forced`, and a column of several targets a number of each, separated by blanks.
     """
     rows = [reader.row(number)] if number is not None else reader.rows
     folder.mkdir(parents=True, exist_ok=True)

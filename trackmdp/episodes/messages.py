@@ -92,14 +92,15 @@ class Form:
         # where steps 1, 2, 3 begin, 2 3 3, and split makes of those [2 5] [4] [] [0].
         active = [each.tolist() for each in np.split(ids, np.searchsorted(steps, t[1:]))]
         inside = {"n_present": there.sum(axis=1)} if episode.several else {}
+        forced = episode.forced(self.task.t_max)
         said: dict[str, Any] = {
             "episode": np.full(len(episode), episode.number),
             "t": t,
             "n": episode.misses,
             "last_cell": self._written(episode.last_cell),
             "active": active,
-            "n_active": episode.action.sum(axis=1),
-            "forced": episode.forced(self.task.t_max),
+            "n_active": episode.action.sum(axis=1) * ~forced,
+            "forced": forced,
             "target": self._written(episode.target),
             "target_x": np.where(there, episode.target % columns, -1),
             # Cells are numbered from the top left, a plot's y axis points upwards: in 3 rows of 4, cell 5 is at x = 1,
@@ -124,7 +125,8 @@ class Form:
 
     def layers(self, episode: Any, first_tick: int) -> Iterator[dict[str, bytes]]:
         """Of each step topic -> message, for viewers."""
-        sensed = self.task.covered(episode.action)
+        on = episode.action & ~episode.forced(self.task.t_max)[:, None]
+        sensed = self.task.covered(on)
         return grid_messages(episode, self.task.size, first_tick, sensed)
 
     def decode(
