@@ -260,7 +260,7 @@ def test_a_log_with_a_problem_file_for_each_motion_is_of_another_format(
         older.setattr(writer, "problem_bytes", lambda group: problem_bytes(group.worlds[0]))
         file = write(tmp_path / "a.mcap", [])
     for read in (EpisodeReader, recover):
-        with pytest.raises(UserError, match=r"^file=.*a.mcap: format 4 \(.*\), expected format 5$"):
+        with pytest.raises(UserError, match=r"^file=.*a.mcap: format 4 \(.*\), expected format 6$"):
             read(file)
     assert [each.name for each in tmp_path.iterdir()] == ["a.mcap"]
 

@@ -18,7 +18,7 @@ from trackmdp.errors import UserError
 from trackmdp.world.group import Subject
 from trackmdp.world.problem_file import PROBLEM, subject_in
 
-LOG_FORMAT = "5"
+LOG_FORMAT = "6"
 """Version of this layout; a reader refuses any other."""
 
 RUN, POLICY, END = "trackmdp.run", "trackmdp.policy", "trackmdp.end"
