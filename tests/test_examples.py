@@ -145,19 +145,21 @@ def test_sweep(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_plugin_learns_by_its_name(tmp_path: Path) -> None:
-    """Installed, the algorithm is found by its name; what it learns is worth about as much as Q_MDP."""
+    """Installed, the algorithm is found by its name; what it learns is worth about as much as Q_MDP, and is loaded."""
     info = tmp_path / "trackmdp_counts-0.1.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: trackmdp-counts\nVersion: 0.1\n")
     (info / "entry_points.txt").write_text("[trackmdp.plugins]\ncounts = trackmdp_counts\n")
     code = (
         "import trackmdp as tm; w = tm.make_world(size=5, cost=0.16); "
-        "run = tm.train(w, 'counts', seed=0, total_frames=50_000, prior=5); "
-        "print(run.evaluation.aihtr, tm.evaluate(w, tm.solve(w, 'qmdp').policy).aihtr, tm.solve(w).upper)"
+        f"run = tm.train(w, 'counts', seed=0, total_frames=50_000, prior=5, folder={str(tmp_path / 'run')!r}); "
+        "from trackmdp.training.run import trained; loaded = trained(str(run.folder), 'cpu')[1]; "
+        "print(run.evaluation.aihtr, tm.evaluate(w, loaded).aihtr, "
+        "tm.evaluate(w, tm.solve(w, 'qmdp').policy).aihtr, tm.solve(w).upper)"
     )
     (line,) = run("-c", code, path=(PLUGIN, tmp_path))
-    learned, qmdp, upper = numbers(line)
-    assert 0.9 * qmdp < learned <= upper
+    learned, loaded, qmdp, upper = numbers(line)
+    assert 0.9 * qmdp < learned == loaded <= upper
 
 
 @pytest.mark.slow

@@ -52,7 +52,7 @@ class Algorithm(Protocol):
         ...
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`."""
+        """Continue from a `state_dict`; `actor` is the policy of that time, which `evaluate` and `export` take."""
         ...
 
 

@@ -64,7 +64,8 @@ class Counts:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
+        """Continue from `state_dict`, with the policy of that time."""
         # `cpu`: a checkpoint is read to the learner's device.
         count, at = (state[name].cpu().numpy() for name in ("count", "at"))
         self.counts = sparse.csr_array((count, tuple(at)), shape=self.counts.shape)
+        self.actor = Policy(self.task, self._sets())
