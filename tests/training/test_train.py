@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -90,15 +91,20 @@ def test_it_is_the_run_of_the_command(tmp_path: Path) -> None:
     ).read_bytes()
 
 
+@pytest.mark.parametrize("algo", ["a2c", "dqn"])
 def test_nothing_is_written_and_nothing_is_disturbed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    log, lines = logging.getLogger("torchrl"), list[logging.LogRecord]()
+    monkeypatch.setattr(log, "level", logging.INFO)
+    monkeypatch.setattr(log, "handle", lines.append)
     torch.manual_seed(5)
     expected = torch.rand(3)
     torch.manual_seed(5)
-    run = train(small_world(), "a2c", **QUICK)
+    run = train(small_world(), algo, **QUICK)
     assert torch.equal(torch.rand(3), expected)
+    assert (lines, log.level) == ([], logging.INFO)
     assert not list(tmp_path.iterdir())
     assert run.folder is None
     assert run.columns["iteration"] == list(range(1, 9))

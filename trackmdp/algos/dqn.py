@@ -9,6 +9,7 @@ Schaul et al. 2016. One cumulative sum per draw, O(capacity): as fast as a segme
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -154,7 +155,11 @@ class _ZeroedStorage(LazyTensorStorage):
     """Slots that hold no transition yet are zero, so that a checkpoint is the same bytes in every process."""
 
     def _init(self, data: TensorDictBase) -> None:
+        log = logging.getLogger("torchrl")
+        level = log.level
+        log.setLevel(logging.WARNING)  # it prints a line for each storage
         super()._init(data)
+        log.setLevel(level)
         self._storage.zero_()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
