@@ -43,6 +43,8 @@ def test_mixed_learns_while_it_collects() -> None:
     assert explore[:4] == [1.0] * 4
     assert explore[4:12] == pytest.approx(np.linspace(1, 0.1, 9)[1:], abs=1e-6)
     assert explore[12:] == pytest.approx([0.1] * 6)
+    half = algorithm("hindsight", world, *SHORT, *MIXED, "algo.explore.start=0.5")
+    assert half.policy.explore.item() == 0.5
 
 
 @pytest.mark.slow

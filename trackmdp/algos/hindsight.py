@@ -101,8 +101,7 @@ class Hindsight(Checkpointed):
         self.updates, self.hidden = budget(task, cfg)
         self._collecting, self._iteration, self._update = iterations, 0, 0
         self._mixed = cfg.collect == "mixed"
-        # With `mixed`, learning starts when exploration begins to fall; before, every batch is fully sensed as without
-        # it.
+        # With `mixed`, learning starts when exploration begins to change.
         share = cfg.explore.begin if self._mixed else 1.0
         self._collect_first = max(1, round(share * iterations))
         alongside = (iterations - self._collect_first) * cfg.updates_per_iteration
@@ -124,6 +123,8 @@ class Hindsight(Checkpointed):
         whole = self._whole_task
         self.actor = Policy.none(whole)
         self.policy = Exploring(whole, device) if self._mixed else Policy.all_on(whole)
+        if isinstance(self.policy, Exploring):
+            self.policy.explore.fill_(cfg.explore.at(0.0))
 
     def step(self, batch: TensorDictBase | None) -> dict[str, float]:
         """Store one batch `[B, time]`, then `updates_per_iteration` updates if enough batches are in."""
