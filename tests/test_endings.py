@@ -164,6 +164,29 @@ def test_ctrl_c_in_the_search_for_a_baseline_writes_nothing(
     assert not list(empty_folder.iterdir())
 
 
+@pytest.mark.parametrize("words", [["algo=model_based"], ["algo=a2c", "targets.count=2"]])
+def test_ctrl_c_in_the_search_after_training_leaves_a_run_to_resume(
+    words: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    empty_folder: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def search(run: Any) -> None:
+        raise KeyboardInterrupt
+
+    frames = ["algo.total_frames=64", "algo.frames_per_batch=64", "algo.envs=8"]
+    wide = ["evaluation.width=9"] if "targets.count=2" in words else []
+    line = ["train", *words, *frames, *wide, "grid.size=2", "kernel=random_walk", "quiet=true"]
+    line += ["hydra.run.dir=a", "resume=auto"]
+    with monkeypatch.context() as cut:
+        cut.setattr(optimal._Run, "search", search)
+        assert main(line) == 130
+    assert capsys.readouterr() == ("", "trackmdp train: interrupted\n")
+    assert not (empty_folder / "a/summary.json").exists()
+    assert main(line) == 0
+    assert (empty_folder / "a/summary.json").is_file()
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="has no /dev/full")
 @pytest.mark.parametrize(
     "words",

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from trackmdp.config import conf_dir
-from trackmdp.paper.calibration import Candidate, candidates, chosen, sensitivity
+from trackmdp.paper.calibration import Candidate, candidates, checks, chosen, sensitivity
 from trackmdp.paper.worlds import (
     COSTS,
     PRINTED_QMDP,
@@ -18,7 +19,7 @@ from trackmdp.paper.worlds import (
     paper_kernel,
     paper_world,
 )
-from trackmdp.solvers import bounds, rules
+from trackmdp.solvers import bounds, optimal, rules
 from trackmdp.solvers.evaluate import evaluate
 
 PAPER = Path(conf_dir()) / "experiment/paper.yaml"
@@ -97,3 +98,12 @@ def test_the_sensitivity_is_the_range_over_the_draws() -> None:
         s.accuracy.median for s in settings if (s.border, s.t_max, s.cost) == ("inside", 1, 0.16)
     ]
     assert max(inside) - min(inside) < 1e-9  # the same for every Z, so the paper did not use it
+
+
+def test_ctrl_c_in_the_search_checks_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def search(run: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(optimal._Run, "search", search)
+    with pytest.raises(KeyboardInterrupt):
+        checks(0)

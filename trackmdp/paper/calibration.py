@@ -170,7 +170,7 @@ def compute(say: Callable[[str], None]) -> Openings:
 def checks(seed: int) -> list[Check]:
     """The paper's theorems on the world with Z = 5 at the lowest price, and the two remarks."""
     world = paper_world(paper_kernel(HARDEST, seed, BORDER), COSTS[0], T_MAX)
-    solution = optimal.solve(world, tolerance=TOLERANCE)
+    solution = optimal.solve(world, tolerance=TOLERANCE).uninterrupted()
     return [
         *theorems.check_theorems(world, solution, TOLERANCE),
         *theorems.check_remarks(TOLERANCE),

@@ -90,6 +90,16 @@ class Solution(Carded):
             return "not closed, stopped by the time limit (another machine may end elsewhere)"
         return "interrupted" if self.interrupted else "not closed"
 
+    def uninterrupted(self) -> Solution:
+        """Itself, for what is of no use in part.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C ended the search.
+        """
+        if self.interrupted:
+            raise KeyboardInterrupt
+        return self
+
     @property
     def upper(self) -> float:
         """No policy has a higher AIHTR."""

@@ -185,19 +185,7 @@ def by_blocks(
 
 def _planned(choice: BaselineConfig, number: int, world: World) -> PolicyTable:  # noqa: ARG001
     """The policy that a solver of the config finds for a block."""
-    return _uninterrupted(world, choice).table
-
-
-def _uninterrupted(world: World, choice: BaselineConfig) -> Solution:
-    """`run_solver` for what is of no use in part.
-
-    Raises:
-        KeyboardInterrupt: Ctrl-C ended its search.
-    """
-    solution = run_solver(world, choice)
-    if solution.interrupted:
-        raise KeyboardInterrupt
-    return solution
+    return run_solver(world, choice).uninterrupted().table
 
 
 def baseline_policy(problem: Problem, choice: BaselineConfig) -> Policy:
@@ -216,7 +204,7 @@ def baseline_policy(problem: Problem, choice: BaselineConfig) -> Policy:
         world = modelled(problem, f"baseline={choice.name}")
         if choice.whole_episodes and world.max_steps is not None:
             world = world.but(max_steps=None)
-        return _uninterrupted(world, choice).policy
+        return run_solver(world, choice).uninterrupted().policy
     made = make(choice, problem)
     return made.policy if isinstance(made, Solution) else as_policy(problem, made)
 

@@ -206,6 +206,8 @@ def beside(
     if not cfg.enabled or group.task.max_steps is not None or group.modes > 1:
         return found(None, None)
     solve = partial(optimal.solve, nodes=cfg.nodes, time_limit=cfg.time_limit)
-    singles = tuple(map(solve, group.kinds)) if single is None else (single,)
+    singles = (
+        tuple(solve(kind).uninterrupted() for kind in group.kinds) if single is None else (single,)
+    )
     solution = GroupSolution(group, singles, upper, sum(each.seconds for each in singles))
     return found(solution, evaluate_group(solution.policy, width=width, seed=seed))

@@ -182,7 +182,8 @@ def _solve(trainer: Learning, learned: Policy) -> Solution | None:
         return None
     start = learned if learned.deterministic else None
     with trainer.console.status(f"solving for the optimum, at most {cfg.nodes:,} nodes"):
-        return optimal.solve(world, nodes=cfg.nodes, time_limit=cfg.time_limit, start=start)
+        found = optimal.solve(world, nodes=cfg.nodes, time_limit=cfg.time_limit, start=start)
+    return found.uninterrupted()
 
 
 def _several(trainer: Learning, policy: Policy, single: Solution | None) -> Several | None:

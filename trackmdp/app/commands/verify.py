@@ -43,12 +43,10 @@ def verify_world(world: World, tolerance: float, folder: Path, console: Console)
     with console.status("checking the paper's theorems"):
         if world.modes > 1:
             solution = optimal.solve(world) if world.tells_all else hidden.solve(world)
-            found = theorems.check_modes(world, solution, tolerance)
+            found = theorems.check_modes(world, solution.uninterrupted(), tolerance)
         else:
             solution = optimal.solve(world, nodes=NODES, tolerance=tolerance)
-            found = theorems.check_theorems(world, solution, tolerance)
-    if solution.interrupted:
-        raise KeyboardInterrupt
+            found = theorems.check_theorems(world, solution.uninterrupted(), tolerance)
     checks = [*found, *theorems.check_remarks(tolerance)]
     optimum = {name: getattr(solution, name) for name in ("lower", "upper", "certified")}
     rows = [each._asdict() | {"verdict": each.verdict, "passed": each.passed} for each in checks]
