@@ -93,6 +93,17 @@ def test_a_disk_too_small_for_any_checkpoint(tmp_path: Path, whole: dict[str, Pa
     assert_same_run(tmp_path, whole["ppo"])
 
 
+def test_a_disk_too_small_for_a_run_from_python(tmp_path: Path) -> None:
+    world = tm.make_world("random_walk", size=3)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        with pytest.raises(RunError, match=f"{tmp_path}.*: File too large; resume=auto"):
+            tm.train(world, total_frames=100, frames_per_batch=100, envs=10, folder=tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
 def test_the_folder_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "run"
     at_iteration(monkeypatch, 3, lambda: shutil.rmtree(folder))

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from trackmdp.durable import UNSUPPORTED, remove_parts, reopen, report_lacking
-from trackmdp.errors import UserError
+from trackmdp.errors import RunError, UserError
 from trackmdp.untrusted import opened
 
 _LOCK = ".lock"
@@ -46,6 +46,25 @@ def locked(folder: Path, key: str = "hydra.run.dir", *, wait: float = 0.0) -> It
         if folder.is_dir() and [each.name for each in folder.iterdir()] == [_LOCK]:
             file.unlink()
         os.close(descriptor)
+
+
+@contextmanager
+def locked_run(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
+    """`locked` around a training run, which can be resumed where a file could not be written.
+
+    Raises:
+        UserError: another process holds it.
+        RunError: a file could not be written.
+    """
+    try:
+        with locked(folder, key):
+            yield
+    except OSError as error:
+        if not folder.is_dir():  # removed meanwhile: nothing to resume
+            raise
+        raise RunError(
+            f"{error.filename or folder}: {error.strerror or error}; resume=auto resumes from the last checkpoint"
+        ) from error
 
 
 def _taken(file: Path) -> int | None:

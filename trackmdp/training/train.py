@@ -24,7 +24,7 @@ from trackmdp.training.blocks import make_trainer
 from trackmdp.training.callbacks import Callback
 from trackmdp.training.display import make_console
 from trackmdp.training.inputs import words_of
-from trackmdp.training.lock import locked
+from trackmdp.training.lock import locked_run
 from trackmdp.training.run import Run, complete
 from trackmdp.untrusted import reason
 from trackmdp.world.group import Group, Subject, check_problem, learned_in
@@ -89,7 +89,7 @@ def train(
     config, subject = _config(problem, typed, place)
     if place is not None:
         _prepare(config, place)
-    with locked(place, "folder") if place else nullcontext(), preserved_global_rng():
+    with locked_run(place, "folder") if place else nullcontext(), preserved_global_rng():
         console = make_console(quiet=not progress)
         return complete(
             make_trainer(subject, config, place, console, callbacks=callbacks, nets=nets)

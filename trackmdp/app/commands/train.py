@@ -9,7 +9,6 @@ from pathlib import Path
 from rich.console import Console
 
 from trackmdp.config import TrainConfig
-from trackmdp.errors import RunError
 from trackmdp.recordings.gridding import said
 from trackmdp.training import notices
 from trackmdp.training.blocks import make_trainer
@@ -18,7 +17,7 @@ from trackmdp.training.display import make_console, show_held_out, table
 from trackmdp.training.folders import finished
 from trackmdp.training.group_run import Several
 from trackmdp.training.inputs import problem_of
-from trackmdp.training.lock import locked
+from trackmdp.training.lock import locked_run
 from trackmdp.training.run import Run, complete
 from trackmdp.world.group import Subject
 
@@ -36,15 +35,8 @@ def run(cfg: TrainConfig, folder: Path, problem: Subject | None = None) -> float
         RunError: learning or writing broke down.
         Preempted: a signal ended the run; it can be resumed.
     """
-    try:
-        with locked(folder):
-            return _run(cfg, folder, problem)
-    except OSError as error:
-        if not folder.is_dir():  # removed meanwhile: nothing to resume
-            raise
-        raise RunError(
-            f"{error.filename or folder}: {error.strerror or error}; resume=auto resumes from the last checkpoint"
-        ) from error
+    with locked_run(folder):
+        return _run(cfg, folder, problem)
 
 
 def _run(cfg: TrainConfig, folder: Path, problem: Subject | None) -> float:
