@@ -121,6 +121,7 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         (f"train resume={LONG}", f"{Path('/')}"),
         (f"train kernel=table kernel.path={LONG}", f"kernel.path={Path('/')}"),
         ("replay file=log.mcap html=/", "html=/: expected a file to write, not a folder"),
+        ("replay file=log.mcap layout=/dev/null", "layout=/dev/null: expected a file to write"),
         ("train cost=0.2", "cost=0.2: expected cost.sensor=0.2"),
         ("train sensor=0.9", "sensor=0.9: expected sensor=miss sensor.p_d=0.9"),
         (

@@ -7,6 +7,7 @@ import doctest
 import importlib
 import inspect
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -241,10 +242,11 @@ def test_a_wrong_type_is_told_in_one_line(call: Callable[..., Any], message: str
 def test_a_file_in_no_folder_is_one_line(
     name: str, write: Callable[[Path], Any], tmp_path: Path
 ) -> None:
-    folder, text = tmp_path / "a.onnx", tmp_path / "text"
+    folder, text, pipe = tmp_path / "a.onnx", tmp_path / "text", tmp_path / "pipe.onnx"
     folder.mkdir()
     text.touch()
-    for file in (tmp_path / "no" / "a.onnx", folder, text / "a.onnx"):
+    os.mkfifo(pipe)
+    for file in (tmp_path / "no" / "a.onnx", folder, text / "a.onnx", pipe):
         with pytest.raises(UserError) as caught:
             write(file)
         expected = "expected a file in a folder that can be written to"

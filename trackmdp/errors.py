@@ -66,11 +66,11 @@ def output_of(given: object, name: str) -> Path:
 
     Raises:
         UserError: it is no path.
-        OutputError: it is a folder, or lies in no folder that can be written to.
+        OutputError: it is a folder or a device, or lies in no folder that can be written to.
     """
     path = path_of(given, name)
-    # With the dot a file is not taken for a folder.
-    if path.is_dir() or not os.access(f"{path.parent}/.", os.W_OK | os.X_OK):
+    # A device would be replaced by the file. With the dot a file is not taken for a folder.
+    if path.exists() != path.is_file() or not os.access(f"{path.parent}/.", os.W_OK | os.X_OK):
         raise OutputError(f"{name}: {path}, expected a file in a folder that can be written to")
     return path
 

@@ -253,11 +253,12 @@ def _check_runs(cfg: CommandConfig, runs: Sequence[str], words: Sequence[str]) -
 
 
 def _check_outputs(cfg: config.ReplayConfig) -> None:
-    """Refuse an output that is a folder where a file is to be written, or the other way round."""
+    """Refuse an output that is a folder or a device where a file is to be written, or the other way round."""
     for key in ("html", "layout"):
-        named = getattr(cfg, key)
-        if named is not None and (Path(named).is_dir() or not Path(named).name):
-            raise UserError(f"{key}={named}: expected a file to write, not a folder")
+        if (named := getattr(cfg, key)) is not None:
+            place = Path(named)
+            if not place.name or place.exists() != place.is_file():
+                raise UserError(f"{key}={named}: expected a file to write, not a folder or device")
     if cfg.csv is not None and Path(cfg.csv).exists() and not Path(cfg.csv).is_dir():
         raise UserError(f"csv={cfg.csv}: expected a folder")
 
