@@ -176,8 +176,8 @@ def test_ctrl_c_in_the_search_after_training_leaves_a_run_to_resume(
 
     frames = ["algo.total_frames=64", "algo.frames_per_batch=64", "algo.envs=8"]
     wide = ["evaluation.width=9"] if "targets.count=2" in words else []
-    line = ["train", *words, *frames, *wide, "grid.size=2", "kernel=random_walk", "quiet=true"]
-    line += ["hydra.run.dir=a", "resume=auto"]
+    world = ["grid.size=2", "kernel=random_walk", "kernel.exit_probability=0.5"]
+    line = ["train", *words, *frames, *wide, *world, "quiet=true", "hydra.run.dir=a", "resume=auto"]
     with monkeypatch.context() as cut:
         cut.setattr(optimal._Run, "search", search)
         assert main(line) == 130
