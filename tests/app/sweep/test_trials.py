@@ -6,7 +6,9 @@ import importlib.util
 import inspect
 import shutil
 import signal
+import sqlite3
 from collections.abc import Generator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +77,21 @@ def test_a_search_that_ends_early_lets_go_of_its_study(
     monkeypatch.setattr("trackmdp.app.sweep.sweep.sweep", cut)
     assert searched("hydra.sweeper.n_trials=2") == 128 + signal.SIGINT
     assert inspect.getgeneratorstate(begun[0]) == inspect.GEN_CLOSED
+
+
+def test_a_study_that_cannot_be_written_is_one_line(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def breaks(cfg: Any, folder: Path) -> float:
+        with closing(sqlite3.connect(folder.parent / "study.db")) as study:
+            study.execute("DROP TABLE trial_values")
+        return peak(cfg, folder)
+
+    stub(monkeypatch, "train", breaks)
+    assert searched("hydra.sweeper.n_trials=2") == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "study.db: " in line
+    assert "no such table: trial_values" in line
 
 
 @pytest.mark.slow

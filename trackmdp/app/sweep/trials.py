@@ -17,7 +17,7 @@ from optuna.distributions import (
     FloatDistribution,
     IntDistribution,
 )
-from optuna.exceptions import ExperimentalWarning
+from optuna.exceptions import ExperimentalWarning, StorageInternalError
 from optuna.samplers import RandomSampler, TPESampler
 from optuna.trial import BaseTrial, FrozenTrial, TrialState
 
@@ -25,7 +25,7 @@ from trackmdp.app.sweep.plan import Job, MakeJobs
 from trackmdp.app.sweep.sweep import run_figures
 from trackmdp.app.words import parsed, single_words, values_of
 from trackmdp.config.sweeping import OptunaConfig
-from trackmdp.errors import UserError
+from trackmdp.errors import RunError, UserError
 from trackmdp.seeding import derive
 from trackmdp.training.folders import run_of
 from trackmdp.untrusted import reason
@@ -50,6 +50,7 @@ def trials(
 
     Raises:
         UserError: there is nothing to search, or the study is one of another search.
+        RunError: the study could not be read or written.
     """
     searched, fixed = _searched(cfg, words)
 
@@ -180,11 +181,12 @@ def _tell(cfg: OptunaConfig, study: Any, trial: Any, job: Job) -> int:
 @contextmanager
 def _study(cfg: OptunaConfig, folder: Path) -> Iterator[Any]:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
+    where = cfg.storage or f"sqlite:///{folder / STUDY}"
     try:
-        storage = optuna.storages.RDBStorage(cfg.storage or f"sqlite:///{folder / STUDY}")
+        storage = optuna.storages.RDBStorage(where)
     except Exception as error:  # of many kinds, those of the data base's driver among them
         raise UserError(
-            f"hydra.sweeper.storage={cfg.storage}: expected a data base's URL ({reason(error)})"
+            f"hydra.sweeper.storage={where}: expected a data base's URL ({reason(error)})"
         ) from error
     try:
         way = _DIRECTIONS[cfg.objective]
@@ -195,6 +197,9 @@ def _study(cfg: OptunaConfig, folder: Path) -> Iterator[Any]:
             raise UserError(f"{_OTHER} (hydra.sweeper.objective is not {cfg.objective})")
         _enqueue_interrupted(study)
         yield study
+    except StorageInternalError as error:  # as on a full disk
+        why = reason(error.__cause__ or error)
+        raise RunError(f"hydra.sweeper.storage={where}: {why}") from error
     finally:
         # Else a connection to the SQLite file stays open until the interpreter ends.
         storage.remove_session()
