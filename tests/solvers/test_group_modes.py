@@ -207,16 +207,20 @@ def test_a_group_is_the_same_from_its_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_plans_are_learned_and_solved_for_and_united(tmp_path: Path) -> None:
-    group = Group([ring(0.1, memory="displacement", clip=1)] * 2)
+@pytest.mark.parametrize("shown", [False, True])
+def test_plans_are_learned_and_solved_for_and_united(tmp_path: Path, shown: bool) -> None:
+    """Where a detection reveals the mode they are merged by gains, and set beside the merged optimum."""
+    own = {"reveals": True} if shown else {"memory": "displacement", "clip": 1}
+    group, name = Group([ring(0.1, **own)] * 2), "gains" if shown else "union"
     solved = tm.solve(group)
-    assert solved.policy.name == "union"
-    assert solved.lower is None
+    assert solved.policy.name == name
+    assert (solved.lower is None) == (not shown)
     assert evaluate(group, solved, width=0.1).aihtr.mean < solved.upper
     few: dict[str, Any] = {"total_frames": 2000, "frames_per_batch": 1000}
     run = tm.train(group, folder=tmp_path, **few, **{"evaluation.width": 0.1})
     again = evaluate(group, tm.load_run(tmp_path), width=0.1)
-    assert run.summary["several"]["merge"] == "union"
+    assert run.summary["several"]["merge"] == name
+    assert (run.summary["several"]["merged_optimum"] is None) == (not shown)
     assert run.summary["several"]["figures"]["aihtr"]["mean"] == again.aihtr.mean
 
 

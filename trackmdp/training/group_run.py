@@ -203,7 +203,7 @@ def beside(
         policies = {} if group.task.limited else fixed_policies(group.single.task)
         fixed = {name: evaluate(group, policy) for name, policy in policies.items()}
         return found(None, None, fixed)
-    if not cfg.enabled or group.task.max_steps is not None or group.modes > 1:
+    if not cfg.enabled or group.task.max_steps is not None or group.hidden > 1:
         return found(None, None)
     solve = partial(optimal.solve, nodes=cfg.nodes, time_limit=cfg.time_limit)
     singles = (
