@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import struct
+import subprocess
+import sys
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -12,6 +15,7 @@ from typing import Any, cast
 import pytest
 
 from tests.training.runs import killed_and_resumed, rows
+from tests.typed import ENVIRONMENT
 from trackmdp.app.cli import main
 from trackmdp.config import MlflowConfig, load_run_config, to_dict
 from trackmdp.errors import UserError, adding
@@ -206,3 +210,33 @@ def test_a_server_that_is_not_there_is_one_line(
     error = capsys.readouterr().err
     assert error.startswith("trackmdp train: log=[mlflow]: ")
     assert error.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_a_database_that_fails_amid_a_run_is_one_line(tmp_path: Path) -> None:
+    """In a process of its own, in which mlflow is first imported by the run."""
+    if find_spec("mlflow") is None:
+        pytest.skip("mlflow is not installed")
+    code = """
+import sqlite3, sys
+from trackmdp.app.cli import main
+from trackmdp.training.loggers import CsvLogger
+
+def breaks(*_):
+    sqlite3.connect("a/mlflow.db").execute("DROP TABLE latest_metrics")
+
+CsvLogger.write = breaks
+sys.exit(main(["train", "log=[mlflow]", "hydra.run.dir=a", *sys.argv[1:]]))
+"""
+    frames = ["algo.total_frames=512", "algo.frames_per_batch=256", "algo.envs=32"]
+    done = subprocess.run(
+        [sys.executable, "-c", code, "grid.size=3", "quiet=true", *frames],
+        cwd=tmp_path,
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("trackmdp train: log=[mlflow]: ")
+    assert done.stderr.count("\n") == 1

@@ -229,8 +229,8 @@ class MlflowLogger(_Tracker):
             os.close(reopen(self._folder / "mlflow.db"))
             # Reports of how mlflow is used would go out over the network from a run that is to stay here.
             os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-        # Its database reports on standard error which tables it makes.
-        os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
+        # Its database reports on standard error which tables it makes, and the traceback of each error that it raises.
+        os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "CRITICAL")
         from mlflow import MlflowClient
 
         uri = self._cfg.uri or f"sqlite:///{self._folder.resolve() / 'mlflow.db'}"
@@ -288,7 +288,8 @@ class MlflowLogger(_Tracker):
     def close(self, error: BaseException | None) -> None:
         """Note how the run ended."""
         ended = "KILLED" if isinstance(error, Preempted) else "FAILED"
-        self._client.set_terminated(self._id, "FINISHED" if error is None else ended)
+        with _answering("mlflow"):
+            self._client.set_terminated(self._id, "FINISHED" if error is None else ended)
 
 
 @contextmanager
