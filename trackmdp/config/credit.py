@@ -103,9 +103,8 @@ class PerSensorConfig(EveryTaskConfig):
         length = task.t_max + 3 + longer
         moves = min(self.buffer_size, root.collector.total_frames)
         whole, events = self.exchange * (task.t_max + 2) * 12, (task.t_max + 3) ** task.order
-        cells, numbers = (
-            (2, 5) if task.markov and not task.order else (length + 3, 8 + whole * events)
-        )
+        alone = task.markov and not task.order
+        cells, numbers = (2, 5) if alone else (length + 3, 8 + whole * events)
         return {
             "algo.buffer_size": moves * (cells * BYTES["int16"] + numbers * BYTES["int64"]),
             # Each cell of a path, and about five numbers that are gathered for it.
