@@ -92,10 +92,6 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"algo": "model_based", "algo.warm_up": 1},
         "algo.warm_up=1: without effect with algo.sensing=null",
     ),
-    (
-        {"algo.gamma": 0.5},
-        "algo.gamma=0.5: without effect with algo.estimate=null, which pools moves",
-    ),
     ({"grid.cell": 10}, "grid.cell=10: without effect without grid.origin"),
     (
         {"kernel.support_size": 1, "kernel.low_probability": 0.2},

@@ -85,9 +85,8 @@ class ModelBasedConfig(EveryTaskConfig):
         if limited or self.sensing != "chosen":
             why = "cost.budget" if limited else f"algo.sensing={self.sensing or 'null'}"
             found["warm_up"] = f"with {why}"
-        if self.estimate == "moves" or (self.estimate is None and root.kernel.markov):
-            why = f"with algo.estimate={self.estimate or 'null'}, which pools moves here"
-            found |= dict.fromkeys(("prior", "gamma"), why)
+        if self.estimate == "moves":
+            found |= dict.fromkeys(("prior", "gamma"), "with algo.estimate=moves")
         return found
 
     def needs(self, task: Any, root: Any) -> Needs:

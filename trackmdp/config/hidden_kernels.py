@@ -38,11 +38,6 @@ class HiddenKernelConfig(KernelConfig):
         "whether a detection reveals the mode as well (Doppler, AIS); false: the cell alone"
     )
 
-    @property
-    def markov(self) -> bool:  # type: ignore[override]  # a class attribute of the other kernels
-        """Whether no mode is hidden."""
-        return self.is_motion and (self.reveals or not self.hides)
-
     def check(self, key: str, root: Any) -> None:
         """Of the learners those with a memory take modes."""
         require_able(root, "remembers", f"with kernel={self.name}")

@@ -143,8 +143,6 @@ class KernelConfig(ChoiceConfig):
     is_motion = True
     hides = False
     """Whether the target has a mode beside its cell (`trackmdp.config.hidden_kernels`)."""
-    markov = True
-    """Whether the next move is known to depend on what a detection reveals alone."""
 
 
 class ExitingConfig(KernelConfig):
