@@ -144,6 +144,10 @@ def test_errors_that_are_behind_each_other_are_one_line(
     assert refused(capsys, "solve") == "first"
 
 
+def interrupted(run: Any) -> None:
+    raise KeyboardInterrupt
+
+
 @pytest.mark.parametrize("kernel", ["random_support", "heading"])
 @pytest.mark.parametrize("command", ["evaluate", "compare"])
 def test_ctrl_c_in_the_search_for_a_baseline_writes_nothing(
@@ -153,10 +157,7 @@ def test_ctrl_c_in_the_search_for_a_baseline_writes_nothing(
     empty_folder: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def search(run: Any) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(optimal._Run, "search", search)
+    monkeypatch.setattr(optimal._Run, "search", interrupted)
     baselines = ["baseline=optimal", *(["baseline=none"] if command == "compare" else [])]
     words = [*baselines, f"kernel={kernel}", "grid.size=3", "quiet=true"]
     assert main([command, *words, "hydra.run.dir=a"]) == 130
@@ -171,15 +172,12 @@ def test_ctrl_c_in_the_search_after_training_leaves_a_run_to_resume(
     empty_folder: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def search(run: Any) -> None:
-        raise KeyboardInterrupt
-
     frames = ["algo.total_frames=64", "algo.frames_per_batch=64", "algo.envs=8"]
     wide = ["evaluation.width=9"] if "targets.count=2" in words else []
     world = ["grid.size=2", "kernel=random_walk", "kernel.exit_probability=0.5"]
     line = ["train", *words, *frames, *wide, *world, "quiet=true", "hydra.run.dir=a", "resume=auto"]
     with monkeypatch.context() as cut:
-        cut.setattr(optimal._Run, "search", search)
+        cut.setattr(optimal._Run, "search", interrupted)
         assert main(line) == 130
     assert capsys.readouterr() == ("", "trackmdp train: interrupted\n")
     assert not (empty_folder / "a/summary.json").exists()

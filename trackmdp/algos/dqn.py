@@ -158,8 +158,10 @@ class _ZeroedStorage(LazyTensorStorage):
         log = logging.getLogger("torchrl")
         level = log.level
         log.setLevel(logging.WARNING)  # it prints a line for each storage
-        super()._init(data)
-        log.setLevel(level)
+        try:
+            super()._init(data)
+        finally:
+            log.setLevel(level)
         self._storage.zero_()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

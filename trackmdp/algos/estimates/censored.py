@@ -130,24 +130,29 @@ def _dense_pairs(kernel: Array, paths: ObservedPaths, copies: Array) -> Array:
     moves = np.ascontiguousarray(kernel[:, :m])
     # 1 at all cells if the end is unknown
     ends = np.concatenate([kernel.T, np.ones((1, m))])
+    for n, part in _by_misses(paths, count):
+        some = paths.pick(part)
+        missed = [1.0 - sensed.toarray() for sensed in some.sets(n)]
+        forward: list[Any] = [summing(some.start, m).T]
+        for each in missed:
+            forward.append((forward[-1] @ moves) * each)
+        later = ends[some.end]
+        weight = copies[part] / np.maximum((forward[n] * later).sum(axis=1), 1e-300)
+        made += (summing(some.end, m + 2) @ (forward[n] * weight[:, None]))[: m + 1].T
+        for t in range(n - 1, -1, -1):
+            later = missed[t] * later
+            made[:, :m] += forward[t].T @ (weight[:, None] * later)
+            if t > 0:  # no move comes before the first one
+                later = later @ moves.T
+    return made
+
+
+def _by_misses(paths: ObservedPaths, most: int) -> Iterator[tuple[int, IndexArray]]:
+    """Numbers of misses, and those of the paths with as many, `most` at once."""
     for n in np.unique(paths.misses):
         whole = np.flatnonzero(paths.misses == n)
-        for begin in range(0, len(whole), count):
-            some = paths.pick(part := whole[begin : begin + count])
-            missed = [1.0 - sensed.toarray() for sensed in some.sets(n)]
-            start = summing(some.start, m)
-            forward: list[Any] = [start.T]
-            for each in missed:
-                forward.append((forward[-1] @ moves) * each)
-            later = ends[some.end]
-            weight = copies[part] / np.maximum((forward[n] * later).sum(axis=1), 1e-300)
-            made += (summing(some.end, m + 2) @ (forward[n] * weight[:, None]))[: m + 1].T
-            for t in range(n - 1, -1, -1):
-                later = missed[t] * later
-                made[:, :m] += forward[t].T @ (weight[:, None] * later)
-                if t > 0:  # no move comes before the first one
-                    later = later @ moves.T
-    return made
+        for begin in range(0, len(whole), most):
+            yield int(n), whole[begin : begin + most]
 
 
 def _pairs(
@@ -226,17 +231,14 @@ def hidden_cells(
     moves, backward, leave = _directions(kernel)
     place = np.cumsum(paths.misses) - paths.misses
     found = np.empty(int(paths.misses.sum()), np.int64)
-    for n in np.unique(paths.misses[paths.misses > 0]):
-        whole = np.flatnonzero(paths.misses == n)
-        for begin in range(0, len(whole), _AT_ONCE):
-            part = whole[begin : begin + _AT_ONCE]
-            some = paths.pick(part)
-            forward, after = _forward(moves, some, some.sets(n)), some.end
-            for t in range(n, 0, -1):
-                later = _ending(backward, leave, forward[t], after)
-                likely = forward[t].multiply(later)
-                after = drawn_columns(likely, some.start, rng)
-                found[place[part] + t - 1] = after
+    for n, part in _by_misses(paths, _AT_ONCE):
+        some = paths.pick(part)
+        forward, after = _forward(moves, some, some.sets(n)), some.end
+        for t in range(n, 0, -1):
+            later = _ending(backward, leave, forward[t], after)
+            likely = forward[t].multiply(later)
+            after = drawn_columns(likely, some.start, rng)
+            found[place[part] + t - 1] = after
     return found
 
 

@@ -264,8 +264,7 @@ def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str | None = N
     sensors: gains would make another policy of it. Else a budget needs gains.
     """
     kinds, limited = {"gains": Merged, "union": Union}, group.task.limited
-    plans = [each.task for each in tables]
-    of_states = all(each.order == 0 and each.revealed == group.modes for each in plans)
+    of_states = all(each.task.order == 0 and each.task.revealed == group.modes for each in tables)
     if merge is None:
         known = group.recorded is None and of_states
         merge = "gains" if (known or limited) and not _one_set(tables) else "union"
