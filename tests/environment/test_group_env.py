@@ -212,12 +212,13 @@ def test_what_several_targets_do_not_have_is_refused() -> None:
         env.step(env.reset().set("action", torch.arange(18).view(2, 9) % 2 == 0))
 
 
+@pytest.mark.usefixtures("little_search")
 @pytest.mark.parametrize(
     ("acted", "shown", "message"),
     [
         (two_kinds(safe_detection=0.9), None, "reads the steps in which the safe action missed"),
         (
-            tm.make_world("heading", size=3, memory="displacement", targets=2),
+            tm.make_world("heading", size=2, memory="displacement", targets=2),
             None,
             "reads the keys",
         ),

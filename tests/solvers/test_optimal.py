@@ -150,6 +150,24 @@ def test_ctrl_c_keeps_the_bracket(monkeypatch: pytest.MonkeyPatch) -> None:
     assert solution.upper == pytest.approx(seen[-1].upper)
 
 
+@pytest.mark.parametrize("limit", [None, 0.0])
+def test_a_search_that_ends_early_is_no_worse_than_its_start(
+    limit: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = paper_world(5, 0.22, 3)
+    best = optimal.solve(world)
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    if limit is None:
+        monkeypatch.setattr(optimal, "follow_credit", interrupted)
+    solution = optimal.solve(world, start=best.table, time_limit=limit)
+    assert solution.interrupted is (limit is None)
+    assert solution.lower == pytest.approx(best.lower)
+    assert solution.upper >= best.lower
+
+
 @pytest.mark.parametrize("calls", [1, 66])
 def test_ctrl_c_amid_an_expansion_proves_nothing_false(
     calls: int, monkeypatch: pytest.MonkeyPatch

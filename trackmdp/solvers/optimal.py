@@ -362,6 +362,8 @@ class _Run:
         self.bound = np.minimum(self.bound, self.value + more)
 
     def solution(self, interrupted: bool) -> Solution:
+        if self.start is not None and not self.certified:  # the search may have ended before it
+            self.use(self.start)
         return Solution(
             self.policy,
             self.evaluation,

@@ -60,17 +60,14 @@ def test_a_report_holds_page_figures_tables_and_what_it_was_made_from(
     assert {row["folder"] for row in rows} == {path.name for path in sweep.iterdir()} - {"report"}
     assert b"the paper" not in made["report.html"].lower()
 
-    # from what it keeps, and from nothing else, the same report is made again
-    assert main(["report", f"sweep={sweep / 'report'}", "hydra.run.dir=two", "quiet=true"]) == 0
-    assert capsys.readouterr().out == ""
-    assert contents(Path("two")) == made
     assert len(run_folders(sweep, None)) == 12  # the report that lies there is no run
 
-    # sweeps are reported one by one
+    # sweeps are reported one by one; from what a report keeps, and from nothing else, the same one is made again
     line = ["report", "-m", f"sweep={sweep},{sweep}/report", "quiet=true", "hydra.sweep.dir=all"]
     assert main(line) == 0
-    pages = [page.read_bytes() for page in Path("all").glob("*/report.html")]
-    assert pages == [made["report.html"]] * 2
+    assert capsys.readouterr().out == ""
+    pages = list(Path("all").glob("*/report.html"))
+    assert [contents(page.parent).items() >= made.items() for page in pages] == [True, True]
 
 
 def test_a_missing_run_is_named_in_one_line_and_in_the_page(
