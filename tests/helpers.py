@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
@@ -46,12 +48,19 @@ __all__ = [
     "evaluate_config",
     "headings",
     "hop_world",
+    "later",
     "random_kernel",
     "random_state",
     "small_world",
     "train_config",
     "worlds",
 ]
+
+
+def later(cases: Iterable[Any]) -> list[Any]:
+    """Of these cases the first of each four is left to the slow tests, and the others to the long ones."""
+    marks = [pytest.mark.slow, *[pytest.mark.long] * 3]
+    return [pytest.param(case, marks=marks[place % 4]) for place, case in enumerate(cases)]
 
 
 def configured(command: str, *overrides: str) -> Any:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers import later
+
 _TRAIN = """
 import sys
 from trackmdp.app.cli import main
@@ -34,8 +36,7 @@ def _python(code: str, folder: Path) -> str:
     return done.stdout
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("algo", ["hindsight", "ppo", "dqn"])
+@pytest.mark.parametrize("algo", later(["ppo", "hindsight", "dqn"]))
 def test_training_loads_no_compiler(algo: str, tmp_path: Path) -> None:
     assert _python(_TRAIN.format(algo=algo) + "print(sorted(loaded))", tmp_path) == "[]\n"
 

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 
-from tests.helpers import ALGORITHMS, algorithm, collect, small_world, train_config
+from tests.helpers import ALGORITHMS, algorithm, collect, later, small_world, train_config
 from trackmdp.app.commands.train import run
 from trackmdp.config import GROUPS
 from trackmdp.config.credit import PerSensorConfig
@@ -179,8 +179,7 @@ def test_a_run_is_decided_by_its_seed(name: str, tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["dqn", "hindsight"])
+@pytest.mark.parametrize("name", later(["dqn", "hindsight"]))
 def test_a_run_is_the_same_in_another_process(name: str, tmp_path: Path) -> None:
     """By the command line, the second time after another run in the same process."""
     words = [sys.executable, str(ROOT / "scripts" / "train.py"), *tiny(name)]

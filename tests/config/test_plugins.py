@@ -106,7 +106,7 @@ def test_it_is_used_by_the_commands_from_python_and_by_the_tests_over_all_choice
 NEW = "sensor=fading task.memory=misses kernel.exit_probability=0.1 grid.size=3 kernel="
 
 
-@pytest.mark.parametrize("kernel", ["random_walk", pytest.param("heading", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kernel", ["random_walk", pytest.param("heading", marks=pytest.mark.long)])
 def test_a_new_sensor_and_a_new_memory_work_in_every_command(
     kernel: str, site: Path, tmp_path: Path
 ) -> None:

@@ -112,7 +112,7 @@ def test_accuracies_stand_beside_the_printed_ones(results: Results) -> None:
     assert row[7] == pytest.approx(50 * sum(run.figure("accuracy") for run in runs))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_same_results_give_the_same_page(
     results: Results, openings: Openings, report: Report
 ) -> None:

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 import trackmdp as tm
+from tests.helpers import later
 from tests.solvers.worlds import best_of_all, paper_world, random_tiny_world
 from trackmdp.app.cli import main
 from trackmdp.environment.env import TrackEnv
@@ -53,9 +54,7 @@ def test_a_budget_above_all_sensors_is_none() -> None:
     np.testing.assert_allclose(one.value, other.value, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "seed", [*range(4), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 100))]
-)
+@pytest.mark.parametrize("seed", [*range(4), *later(range(4, 100))])
 def test_no_policy_with_a_budget_is_above_the_dual_over_prices(seed: int) -> None:
     world = tiny(seed, 1)
     dual = frontier(world.but(cost=0.2, budget=None), near=1.0)
@@ -64,9 +63,7 @@ def test_no_policy_with_a_budget_is_above_the_dual_over_prices(seed: int) -> Non
         assert best <= dual.worth(1.0, price) + 1e-9
 
 
-@pytest.mark.parametrize(
-    "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 6))]
-)
+@pytest.mark.parametrize("seed", [0, *later(range(1, 6))])
 def test_corners_of_a_frontier_with_a_budget_are_optima_of_their_prices(seed: int) -> None:
     world = tiny(seed, 1)
     edge, free = frontier(world), frontier(world.but(budget=None))

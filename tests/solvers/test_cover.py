@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy import sparse
 
-from tests.helpers import random_kernel, small_world
+from tests.helpers import later, random_kernel, small_world
 from tests.solvers.worlds import all_plans, best_of_all, followed, footprint_world
 from trackmdp.arrays.entries import row_index
 from trackmdp.arrays.types import Array
@@ -28,12 +27,12 @@ from trackmdp.world.model import World
 PLANNERS = (rules.clocked_policy, rules.qmdp, rules.fcr, rules.myopic)
 
 
-def later(since: int, end: int, step: int = 1) -> list[Any]:
-    """Cases that are left to the slow tests."""
-    return [pytest.param(each, marks=pytest.mark.slow) for each in range(since, end, step)]
-
-
-BUDGETS = [None, 1, *later(0, 4, 2)]
+BUDGETS = [
+    None,
+    1,
+    pytest.param(0, marks=pytest.mark.slow),
+    pytest.param(2, marks=pytest.mark.slow),
+]
 
 
 def one_move(world: World) -> Shared:
@@ -120,7 +119,7 @@ def test_shares_are_rounded_within_the_budget() -> None:
 
 @pytest.mark.parametrize("budget", BUDGETS)
 @pytest.mark.parametrize("misses", [False, True])
-@pytest.mark.parametrize("seed", [*range(8), *later(8, 20)])
+@pytest.mark.parametrize("seed", [*range(8), *later(range(8, 20))])
 def test_sets_and_bounds_of_coverage_problems(seed: int, misses: bool, budget: int | None) -> None:
     """Some gains are losses: cells that a set must not see."""
     rng, world = np.random.default_rng(seed), footprint_world(seed).but(budget=budget)
@@ -239,7 +238,7 @@ def test_a_bracket_is_no_wider_than_to_the_clocked_bound(monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize("budget", BUDGETS)
 @pytest.mark.parametrize("misses", [False, True])
-@pytest.mark.parametrize("seed", [*range(5), *later(5, 12)])
+@pytest.mark.parametrize("seed", [*range(5), *later(range(5, 12))])
 def test_bounds_and_planners_against_all_plans(seed: int, misses: bool, budget: int | None) -> None:
     world = footprint_world(seed).but(budget=budget)
     if misses:
@@ -267,7 +266,7 @@ def test_bounds_and_planners_against_all_plans(seed: int, misses: bool, budget: 
 
 
 @pytest.mark.parametrize("budget", BUDGETS)
-@pytest.mark.parametrize("seed", [*range(4), *later(4, 10)])
+@pytest.mark.parametrize("seed", [*range(4), *later(range(4, 10))])
 def test_sets_ahead_are_the_best_plans_of_small_worlds(seed: int, budget: int | None) -> None:
     world = footprint_world(seed).but(budget=budget, t_max=1)
     value, sets = bounds.clocked_table(world).table[:, 0], lookahead.solve(world).dense()

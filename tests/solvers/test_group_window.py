@@ -62,12 +62,12 @@ def test_plans_are_learned_in_the_window_and_merged(
     run = tmp_path / "a"
     words = [
         "targets.count=2",
-        "grid.size=8",
+        "grid.size=6",
         "grid.window=2",
         "evaluation.width=0.2",
         "log=[mcap]",
     ]
-    assert main(["train", *words, "collector.total_frames=20000", f"hydra.run.dir={run}"]) == 0
+    assert main(["train", *words, "collector.total_frames=10000", f"hydra.run.dir={run}"]) == 0
     assert main(["evaluate", f"run={run}", f"hydra.run.dir={tmp_path / 'b'}"]) == 0
     assert "merged by gains" in capsys.readouterr().out
     assert main(["replay", f"file={run / 'episodes.mcap'}", "verify=true"]) == 0

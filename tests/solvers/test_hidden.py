@@ -74,7 +74,7 @@ def test_exchange_goes_on_where_one_set_at_a_time_stops() -> None:
     assert exchange.exchanged(start).aihtr > one.aihtr > start.aihtr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_annealed_and_crossed_policies_end_higher(monkeypatch: pytest.MonkeyPatch) -> None:
     """On 3 x 3 cells a run of `model_based` ended at 37.2789, homotopies below it."""
     world, values = make_world("heading", size=3), []

@@ -138,7 +138,7 @@ def test_values_are_those_of_the_chain(problem: Problem, seed: int, draws: bool)
     check_values(problem, seed, draws)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @settings(max_examples=2000)
 @given(problems(), st.integers(0, 2**16), st.booleans())
 def test_values_of_many_more(problem: Problem, seed: int, draws: bool) -> None:
@@ -267,7 +267,7 @@ def test_solving_finds_the_best_plans_of_keys_where_modes_are_hidden(world: Worl
     check_keys(world)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @settings(max_examples=60)
 @given(problems(**(TINY | HIDDEN | {"sizes": ((1, 2), (1, 3))}), memories=[*MEMORIES][:2]))
 def test_best_plans_of_keys_of_many_more(world: World) -> None:

@@ -18,6 +18,7 @@ import pytest
 from scipy import sparse
 
 import trackmdp as tm
+from tests.helpers import later
 from tests.typed import ENVIRONMENT, typed
 from trackmdp.app.cli import main
 from trackmdp.config.compose import compose
@@ -82,7 +83,7 @@ def test_footprints_are_cut_to_a_rectangle() -> None:
         {"budget": 2, "window": 2},
         {"spacing": 1, "budget": 1, "window": 3, "t_max": 0},  # wider than the halo of a move
         pytest.param({"spacing": 2}, marks=pytest.mark.slow),
-        pytest.param({"spacing": 2, "detection": 0.8, "budget": 2}, marks=pytest.mark.slow),
+        pytest.param({"spacing": 2, "detection": 0.8, "budget": 2}, marks=pytest.mark.long),
     ],
 )
 def test_blocks_lose_nothing_with_footprints_and_a_budget(options: dict[str, Any]) -> None:
@@ -223,8 +224,7 @@ def test_no_more_workers_are_started_than_there_are_blocks(monkeypatch: pytest.M
         tm.solve(tm.make_world("random_walk", size=5), block=3, workers=1_000_000)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, 2, 4])
+@pytest.mark.parametrize("workers", later([2, 1, 4]))
 def test_a_ray_cluster_of_any_size_finds_the_same_bytes(workers: int) -> None:
     pytest.importorskip("ray")
     cfg = compose("solve", {"partition.block": 4, "grid.size": 9})
@@ -278,8 +278,7 @@ class Dies:
         return number * number
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("cluster", [None, "local"])
+@pytest.mark.parametrize("cluster", later([None, "local"]))
 def test_what_a_killed_worker_had_is_done_again(tmp_path: Path, cluster: str | None) -> None:
     if cluster:
         pytest.importorskip("ray")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import trackmdp as tm
+from tests.helpers import later
 from trackmdp.app.cli import main
 from trackmdp.errors import Preempted, UserError
 from trackmdp.sensing.coverage import discs
@@ -235,8 +236,7 @@ def test_a_signal_in_the_last_iteration_of_a_block_begins_no_other(
     assert [each.name for each in (tmp_path / "blocks").iterdir()] == ["00000"]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("cluster", [None, "local"])
+@pytest.mark.parametrize("cluster", later([None, "local"]))
 def test_the_result_does_not_depend_on_the_workers(
     uncut: tm.Run, tmp_path: Path, cluster: str | None
 ) -> None:

@@ -21,7 +21,7 @@ import pytest
 import torch
 
 import trackmdp as tm
-from tests.helpers import train_config
+from tests.helpers import later, train_config
 from tests.training.runs import (
     BUDGET,
     QUICK,
@@ -239,9 +239,8 @@ def test_a_signal_to_the_workers_as_well_is_no_failure(
     assert (told.value.signal, saved(tmp_path)) == (signal.SIGTERM, [4])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("collector", "when"), [("multi_sync", "between"), ("multi_async", "while collecting")]
+    ("collector", "when"), later([("multi_sync", "between"), ("multi_async", "while collecting")])
 )
 def test_a_worker_that_is_killed_is_named(
     collector: str, when: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -345,8 +344,7 @@ worker.join()
         assert learner.communicate(timeout=60)[0] == ""
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("mode", "step"), [("kill", 23), ("power", 19), ("error", 21)])
+@pytest.mark.parametrize(("mode", "step"), later([("kill", 23), ("power", 19), ("error", 21)]))
 def test_a_run_that_ends_at_any_file_operation_resumes_to_the_same_run(
     mode: str, step: int, tmp_path: Path
 ) -> None:
@@ -374,8 +372,7 @@ class Held(Callback):
         )
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("algo", ["ppo", "dqn"])
+@pytest.mark.parametrize("algo", later(["ppo", "dqn"]))
 def test_a_longer_run_holds_no_more_files_and_tensors(algo: str, tmp_path: Path) -> None:
     held = Held()
     options: dict[str, Any] = (

@@ -97,7 +97,7 @@ def test_what_sensors_gain_beside_the_others_leads_to_the_optimum(algo: str, t_m
     assert (best.upper - run.evaluation.aihtr) / run.evaluation.expected_length < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_sets_that_cool_down_do_not_end_where_no_single_sensor_gains() -> None:
     """Hard sets from the first update on end at a regret of .0097 per step here."""
     plain = tm.make_world("random_support", size=8, cost=0.16)

@@ -354,6 +354,6 @@ def test_a2c_with_joint_credit_learns_two_targets() -> None:
     assert below_the_bound(targets, 40_960) < 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a2c_with_joint_credit_learns_two_targets_to_within_a_tenth_of_the_bracket() -> None:
     assert below_the_bound(tm.make_world(size=4, targets=2), 81_920) < 0.1

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 import trackmdp as tm
-from tests.helpers import headings
+from tests.helpers import headings, later
 
 FEW = {"updates": 4, "updates_per_iteration": 4, "batch_size": 256, "hidden": 8}
 """Of what learns after collecting."""
@@ -47,8 +47,7 @@ def test_the_kernel_of_told_modes_is_learned(sensing: str) -> None:
     assert (best.lower - run.evaluation.aihtr) / run.evaluation.expected_length < 0.006
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("known", KNOWN)
+@pytest.mark.parametrize("known", later(KNOWN))
 def test_hindsight_ends_near_what_is_solved(known: str) -> None:
     world = headings(4, 0.9, cost=0.16, **KNOWN[known])
     run = tm.train(world, "hindsight", updates=300, **{"collector.total_frames": 100_000})

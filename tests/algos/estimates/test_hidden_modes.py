@@ -158,7 +158,7 @@ def test_long_tracks_are_cut() -> None:
     assert [len(step) for step in paths.steps] == [3] * 50 + [2] * 50
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_velocity_is_learned_from_its_moves() -> None:
     """Plans on paths alone stop .004 to .009 a step below the policy found on the motion."""
     world = tm.make_world("constant_velocity", size=3, memory="displacement")

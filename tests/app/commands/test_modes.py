@@ -45,7 +45,7 @@ def test_verify_says_what_has_no_case(here: Path) -> None:
     assert (here / "s/verification.json").is_file()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_sweep_over_memories_is_reported(here: Path) -> None:
     """There are maps of both policies, of the one that remembers more averaged over its keys; nothing is missing."""
     for memory in ("cell", "displacement"):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.config.cases import composed
-from tests.helpers import BASELINES
+from tests.helpers import BASELINES, later
 from tests.reads import record_reads, unread
 from trackmdp.app.prepare import Prepared
 from trackmdp.config import GROUPS, conf_dir
@@ -58,8 +58,7 @@ def test_train_reads_the_options_of_several_targets(tmp_path: Path) -> None:
     assert not never_read("train", words, tmp_path) & OF_SEVERAL
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("collector", ["multi_sync", "multi_async"])
+@pytest.mark.parametrize("collector", later(["multi_sync", "multi_async"]))
 def test_collectors_with_workers_read_every_option(collector: str, tmp_path: Path) -> None:
     words = f"collector={collector} {SHORT}{MIXED}"
     assert never_read("train", words, tmp_path) == OF_BLOCKS | OF_SEVERAL

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tests.config.cases import composed
-from tests.helpers import headings, small_world
+from tests.helpers import headings, later, small_world
 from tests.reads import record_reads, unread
 from tests.tracks import digest_of, drawn, write
 from tests.training.runs import assert_same_run, at_iteration
@@ -198,8 +198,7 @@ def test_ends_and_starts_are_options(ends: str, starts: str, folder: Path) -> No
     assert length == pytest.approx(held_out.lengths.mean() - (ends == "cut"))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("collector", ["multi_sync", "multi_async"])
+@pytest.mark.parametrize("collector", later(["multi_sync", "multi_async"]))
 def test_workers_replay_tracks_too(collector: str, folder: Path) -> None:
     assert train("a", f"collector={collector}", "collector.workers=2") == 0
     assert json.loads((folder / "a/summary.json").read_text())["frames"] == 2048
