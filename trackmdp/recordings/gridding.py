@@ -75,7 +75,7 @@ def to_tracks(
         UserError: the projection does not fit the positions, or no track is left.
     """
     flat, place = _placed(positions, grid, source, ~np.isin(positions.track, held_out))
-    wide, high = np.ptp(_spread(flat.x, flat.y), axis=1)
+    wide, high = np.ptp(_spread(flat.x, flat.y), axis=1).tolist()
     # 0: nothing moves
     if not positions.geographic and 0 < max(wide, high) < grid.cell / _PARTS:
         raise UserError(
@@ -95,11 +95,12 @@ def to_tracks(
         "steps": len(cells),
         **counts,
     }
-    if not len(tracks):
-        raise UserError(f"{source}: no track of at least {grid.shortest} cells; {said(report)}")
-    if counts[_OUTSIDE]:  # the grid.size that would do, where the default was forgotten
+    # The grid.size that would do, where the default was forgotten; none where the projection reaches no position.
+    if counts[_OUTSIDE] and math.isfinite(max(wide, high) / grid.cell):
         columns, rows = (max(1, math.ceil(each / grid.cell)) for each in (wide, high))
         report |= {"rows that nearly all positions span": rows, "columns that they span": columns}
+    if not len(tracks):
+        raise UserError(f"{source}: no track of at least {grid.shortest} cells; {said(report)}")
     return tracks, report, place
 
 
