@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -75,6 +76,12 @@ def test_a_map_of_values_shows_the_distance_from_the_bound(drawn: list[Mapped]) 
         found = [row[2 + place] for row in figure.table.rows]
         assert found == pytest.approx(np.where(expected < 1e-6, 0, expected))
     assert [row[-1] for row in figure.table.rows] == pytest.approx(group[0].bound - group[0].qmdp)
+    # Two maps of 155 points: 24 letters in a line.
+    long = replace(group[0], method="model_based, task.memory=displacement")
+    drawn = maps.missing_map("x", [long], ends)
+    assert {"model_based,", "task.memory=displacement"} <= {
+        *re.findall(r">([^<>]+)</text>", drawn.svg.decode())
+    }
 
 
 def test_shades_are_as_frequent_as_each_other_and_shared() -> None:

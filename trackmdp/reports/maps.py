@@ -5,6 +5,7 @@ On a large grid the number of sensors in place of the sets, and means over squar
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
@@ -16,7 +17,9 @@ from trackmdp.reports.style import (
     BLUE,
     INK,
     PALE,
+    TEXT,
     VERMILION,
+    WIDTH,
     Axes,
     Canvas,
     Figure,
@@ -141,7 +144,7 @@ def _shaded(
 
         colours = colormaps["viridis_r"].resampled(len(ends) - 1)
         every = np.atleast_1d(figure.subplots(1, len(tiles)))
-        for axes, (head, values) in zip(every, tiles.items(), strict=True):
+        for axes, head, values in zip(every, _heads(figure, tiles), tiles.values(), strict=True):
             mesh = axes.pcolormesh(values, cmap=colours, norm=BoundaryNorm(ends, len(ends) - 1))
             axes.invert_yaxis()  # row 1 on top, as in the numbering of cells
             axes.set(aspect="equal", xticks=[], yticks=[], title=head)
@@ -164,6 +167,16 @@ def _shaded(
     ]
     columns = [Column("row"), Column("column"), *(Column(label, 4) for label in tiles)]
     return draw_figure(Table(name, title, columns, rows), 2.4, paint)
+
+
+def _heads(figure: Canvas, tiles: _Tiles) -> list[str]:
+    """The headings in lines no wider than a map; the figure grows by the lines beyond the first."""
+    # Points: a letter is some .6 of its height wide.
+    wide = int(WIDTH * 72 / (0.6 * TEXT * len(tiles)))
+    heads = [textwrap.fill(head, wide, break_on_hyphens=False) for head in tiles]
+    lines = max(head.count("\n") for head in heads)
+    figure.set_figheight(figure.get_figheight() + lines * 1.5 * TEXT / 72)
+    return heads
 
 
 def _side(size: _Size) -> int:
