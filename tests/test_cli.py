@@ -234,11 +234,13 @@ def test_price_files_are_checked_before_a_folder_is_made(
     (tmp_path / "short.csv").write_text("1,2,3\n")
     (tmp_path / "negative.csv").write_text("\n".join(["1,1,1", "1,-2,1", "1,1,1"]))
     (tmp_path / "broken.csv").write_text("a,b\n")
+    (tmp_path / "empty.csv").touch()
     (tmp_path / "semicolons.csv").write_text("1;1;1\n" * 3)
     for name, message in (
         ("short.csv", "3 values, expected one number or 9"),
         ("negative.csv", "cell 4 has -2, expected"),
         ("broken.csv", "not a table of numbers"),
+        ("empty.csv", "empty.csv: not a table of numbers (no numbers in it)"),
         ("semicolons.csv", "column 1; expected numbers with commas between them)"),
     ):
         assert message in refused(capsys, "train", "grid.size=3", f"cost.sensor=../{name}")

@@ -226,7 +226,7 @@ DAMAGED = {
     "ragged": ("points", "id,t,x,y\n1,2,3,4\n1,2,3,4,5,6\n", "not a table of positions ("),
     "binary": ("points", b"\x00\xff\xfe" * 50, "not a table of positions ("),
     "parquet cut": ("points", b"PAR1" + bytes(50), "not a table of positions ("),
-    "nothing": ("points", "", "not a table of positions ("),
+    "nothing": ("points", "", "not a table of positions (columns none: expected id ("),
     "no rows": (
         "points",
         "id,t,x,y\n",

@@ -87,7 +87,7 @@ def test_a_file_that_has_changed_is_read_again(tmp_path: Path) -> None:
         ("track,cell\n1e300,1\n", "track of entry 1 is 1e+300, expected an integer"),
         ("track,cell\n", "no tracks, expected at least two"),
         ("track,cell", "no tracks, expected at least two"),
-        ("", "columns , expected track, cell (or row, column) and, if wanted, step"),
+        ("", "columns none, expected track, cell (or row, column) and, if wanted, step"),
         ("0,1\n0,2\n", "columns 0, 1, expected track, cell"),
         ("track,cell,row\n0,1,1\n", "columns track, cell, row, expected track, cell"),
         (

@@ -256,6 +256,8 @@ def _csv(stream: BinaryIO, comments: str | None = "#", **how: Any) -> Array:
     text = io.TextIOWrapper(stream, encoding="utf-8-sig")
     try:
         table: Array = np.loadtxt(text, delimiter=",", ndmin=2, comments=comments, **how)
+    except UserWarning:  # of no data, naming the stream
+        raise ValueError("no numbers in it") from None
     except ValueError as error:
         said = str(error).rstrip(".")
         raise ValueError(f"{said}; expected numbers with commas between them") from None

@@ -218,7 +218,8 @@ def _chosen_columns(names: Iterable[str], own: Sequence[str]) -> dict[str, str]:
     if missing or len(pairs) != 1:
         wanted = [*missing, *(["either x, y or lat, lon"] if len(pairs) != 1 else [])]
         hint = "" if own else ", or kernel.columns=[id:NAME,...]"
-        raise ValueError(f"columns {', '.join(known)[:80]}: expected {' and '.join(wanted)}{hint}")
+        header = ", ".join(known)[:80] or "none"
+        raise ValueError(f"columns {header}: expected {' and '.join(wanted)}{hint}")
     chosen = {name: found[name] for name in ("id", "time", *pairs[0])}
     for name in chosen.values():
         if lowered.count(name.strip().lower()) > 1:

@@ -226,7 +226,7 @@ def read_tracks(path: str | Path, size: Size, exits: bool, shortest: int = 1) ->
     """
     source, (columns, texts) = f"kernel.path={path}", read_columns("kernel.path", path, ids="track")
     if set(columns) - {"step"} not in _COLUMNS:
-        raise UserError(f"{source}: columns {', '.join(columns)}, expected {_FORMAT}")
+        raise UserError(f"{source}: columns {', '.join(columns) or 'none'}, expected {_FORMAT}")
     if not len(columns["track"]):
         raise UserError(f"{source}: no tracks, expected at least two")
     numbers = {name: _integers(source, name, column) for name, column in columns.items()}
