@@ -26,11 +26,17 @@ def main(policy_file: Path, detections: Path) -> None:
         rows = list(csv.DictReader(stream))
         if len(ids := sorted({row["id"] for row in rows if row.get("id")})) > 1:
             raise UserError(f"{detections}: ids {', '.join(ids[:3])}, expected one target")
-        for row in rows:
+        if not rows:
+            raise UserError(
+                f"{detections}: no lines, expected a detection under lat and lon, or x and y"
+            )
+        for line, row in enumerate(rows, 2):
             axes = ("lat", "lon") if "lat" in row else ("x", "y")
             at = tuple(float(row[name]) for name in axes if row.get(name))
+            if len(at) == 1 or not (at or tracker):  # the first line is a detection
+                raise UserError(f"{detections}: line {line}: {row}, expected {' and '.join(axes)}")
             if tracker is None:
-                tracker = policy.tracker(at=at)  # the first line is a detection
+                tracker = policy.tracker(at=at)
                 continue
             on, due = tracker.sensors(), tracker.safe
             try:
