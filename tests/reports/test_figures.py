@@ -89,10 +89,11 @@ def test_learned_policies_lie_over_the_frontier_of_the_solved_ones() -> None:
             }
             made = run(f"{price}-{seed}", "algo=a2c", options=options, **figures_of_run)
             runs.append(replace(made, references=best))
-    found = study(runs)
+    options = {"cost.sensor": 1.0, "kernel.support_size": 9}
+    found = study([*runs, run("elsewhere", "algo=ppo", options=options)])
     (priced,) = figures.panels(found)
     figure = swept_figure(found, priced)
-    assert figure
+    assert figure and b">a2c<" in figure.svg and b">ppo<" not in figure.svg  # of another world
     rows = {(row[0], row[1]): row[2:] for row in figure.table.rows}
     line = {price: rows["best known", price][2] for price, *_ in solved}
     assert line == {1.0: True, 2.0: False, 3.0: True, 4.0: False}

@@ -90,7 +90,8 @@ def swept_figure(study: Study, panel: Panel) -> Figure | None:
     policy may lie above it, as D is paid as well.
     """
     title, worlds = panel
-    learned = {method: _learned(study, worlds, method) for method in study.methods}
+    every = {method: _learned(study, worlds, method) for method in study.methods}
+    learned = {method: places for method, places in every.items() if places}
     best = [
         _Place(price, *(study.reference(world, "best known", key) for key in _PLANE))
         for price, world in worlds.items()
@@ -104,8 +105,9 @@ def swept_figure(study: Study, panel: Panel) -> Figure | None:
             _points(axes, hull, vars(REFERENCES["best known"]) | {"label": name})
         # Also those below the line, which a mixture of their neighbours beats.
         _points(axes, best, {"color": INK, "marker": "+", "linestyle": ""})
-        for method, look in looks_of(study.methods).items():
-            _points(axes, learned[method], vars(look) | {"linestyle": "", "label": method})
+        looks = looks_of(study.methods)
+        for method, places in learned.items():
+            _points(axes, places, vars(looks[method]) | {"linestyle": "", "label": method})
         axes.set(xlabel="sensors per step", ylabel="accuracy")
         tidy(axes)
         legend(figure, axes)
