@@ -209,9 +209,8 @@ def _chosen_columns(names: Iterable[str], own: Sequence[str]) -> dict[str, str]:
     }
     there = ((ours, each) for ours in usual for each in reversed(usual[ours]) if each in known)
     found = {name: known[each] for name, each in there}  # the first one is the last set
-    pairs = [pair for pair in (("x", "y"), ("lon", "lat")) if found.keys() >= {*pair}]
-    named = {each.partition(":")[0] for each in own}
-    pairs = [pair for pair in pairs if named & {*pair}] or pairs  # a file may have both
+    pairs = [pair for pair in (("x", "y"), ("lon", "lat")) if found.keys() >= {*pair}]  # or both
+    pairs = [pair for pair in pairs if {each.partition(":")[0] for each in own} & {*pair}] or pairs
     missing = [
         f"{name} ({', '.join(usual[name][:3])})" for name in ("id", "time") if name not in found
     ]
