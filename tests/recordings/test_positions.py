@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import json
 import os
 import re
 from contextlib import nullcontext
@@ -12,7 +13,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
+from pyarrow import parquet
 
 from trackmdp.errors import UserError, adding
 from trackmdp.recordings.positions import (
@@ -147,11 +150,28 @@ def test_a_column_of_missing_times_holds_none() -> None:
 def test_parquet_is_as_csv(tmp_path: Path) -> None:
     times = pd.to_datetime(["2024-05-01T12:00:05", "2024-05-01T12:00:00"])
     table = pd.DataFrame({"id": [3, 3], "time": times, "x": [1, 2.5]})
-    table.assign(y=[0, 1], other=["a", None]).to_parquet(tmp_path / "t.parquet")
-    assert rows(read_positions(tmp_path / "t.parquet", "points")) == [
-        (0, 0, NOON, 2.5, 1),
-        (0, 0, NOON + 5, 1, 0),
-    ]
+    table = table.assign(y=[0, 1], other=["a", None])
+    for stored in (table, table.set_index("time")):
+        stored.to_parquet(tmp_path / "t.parquet")
+        assert rows(read_positions(tmp_path / "t.parquet", "points")) == [
+            (0, 0, NOON, 2.5, 1),
+            (0, 0, NOON + 5, 1, 0),
+        ]
+
+
+@pytest.mark.parametrize("form", ["parquet", "json"])
+def test_long_ids_stay_apart_where_one_is_missing(tmp_path: Path, form: str) -> None:
+    ids = [2**60, 2**60 + 1, None]  # the same float
+    if form == "parquet":
+        table = pa.table({"id": ids, "t": [0, 0, 0], "x": [0, 0, 0], "y": [0, 0, 0]})
+        parquet.write_table(table, tmp_path / "t.parquet")  # without a word of pandas
+    else:
+        point = {"type": "Point", "coordinates": [8, 47]}
+        each = [{"geometry": point, "properties": {"id": own, "t": 0}} for own in ids]
+        content = {"type": "FeatureCollection", "features": each}
+        (tmp_path / "t.json").write_text(json.dumps(content))
+    found = read_positions(tmp_path / f"t.{form}", "points" if form == "parquet" else "geojson")
+    assert (found.track.tolist(), found.dropped[NO_POSITION]) == ([0, 1], 1)
 
 
 def test_gpx_keeps_segments_apart(tmp_path: Path) -> None:

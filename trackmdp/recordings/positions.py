@@ -253,9 +253,7 @@ def _parquet_names(stream: BinaryIO) -> list[str]:
     file = parquet.ParquetFile(stream)
     # Some bytes of a file may unfold to any number of equal values: its own claims are held against the limit first.
     groups = (file.metadata.row_group(place) for place in range(file.metadata.num_row_groups))
-    widest = max(
-        8, *(column.length for column in file.schema)
-    )  # of numbers, and of bytes of a fixed length
+    widest = max(8, *(column.length for column in file.schema))  # a number, or bytes
     _check_unfolded(
         max(sum(group.total_byte_size for group in groups), widest * file.metadata.num_rows)
     )
@@ -280,7 +278,8 @@ def _read_parquet(stream: BinaryIO, columns: Mapping[str, str]) -> Any:
             table = table.set_column(
                 place, table.column_names[place], column.cast(column.type.value_type)
             )
-    return table.to_pandas()
+    # What was an index of pandas is a column; ids beyond 2^53 stay whole where one is missing.
+    return table.to_pandas(ignore_metadata=True, integer_object_nulls=True)
 
 
 def _check_unfolded(size: int) -> None:
@@ -304,7 +303,8 @@ def _of_rows(rows: Sequence[tuple[Any, ...]], **are: Any) -> Positions:
     """`Positions` of rows id, time, x, y, piece; see `table_of`."""
     import pandas as pd
 
-    frame = pd.DataFrame(rows, columns=("id", "time", "x", "y", "piece"))
+    # Else ids would be floats where one is missing, and two beyond 2^53 the same.
+    frame = pd.DataFrame(rows, columns=("id", "time", "x", "y", "piece"), dtype=object)
     return table_of(*(frame[name] for name in frame), **are)
 
 
