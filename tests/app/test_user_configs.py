@@ -72,6 +72,8 @@ def test_a_config_folder_of_ones_own_adds_choices(
             "not a config",
         ),
         ("experiment/a", "seed: &a [*a]", "experiment=a", "not a config (an alias"),
+        ("experiment/a", "seed: !!set {a}", "experiment=a", "experiment/a.yaml: not a config"),
+        ("experiment/a", "# @package \nseed: 1", "experiment=a", "experiment/a.yaml: not a config"),
         (
             "experiment/a",
             f"seed: {'[' * 3000}{']' * 3000}",

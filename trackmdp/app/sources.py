@@ -12,7 +12,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 
-from trackmdp.untrusted import parse_yaml, read_text
+from trackmdp.untrusted import decoded, parse_yaml, read_text
 
 _folders: list[tuple[str, str]] = []
 """(provider, path) of the folders that `_Folders` adds, while `searched` is open."""
@@ -65,4 +65,5 @@ class _UserFolder(FileConfigSource):
         file = Path(self.path) / self._normalize_file_name(config_path)
         if file.is_file():
             parse_yaml(read_text(file, links=True), str(file))
-        return super().load_config(config_path)
+        with decoded(str(file), "a config"):
+            return super().load_config(config_path)
