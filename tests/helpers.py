@@ -60,7 +60,8 @@ __all__ = [
 def later(cases: Iterable[Any]) -> list[Any]:
     """Of these cases the first of each four is left to the slow tests, and the others to the long ones."""
     marks = [pytest.mark.slow, *[pytest.mark.long] * 3]
-    return [pytest.param(case, marks=marks[place % 4]) for place, case in enumerate(cases)]
+    listed = (case if isinstance(case, tuple) else (case,) for case in cases)
+    return [pytest.param(*case, marks=marks[place % 4]) for place, case in enumerate(listed)]
 
 
 def configured(command: str, *overrides: str) -> Any:

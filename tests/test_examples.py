@@ -193,7 +193,7 @@ def test_a_tracker_is_driven_by_a_file_of_detections(tmp_path: Path) -> None:
         ("policy.npz", ["x,y", ","], r"seen.csv: line 2: \{'x': '', 'y': ''\}, expected x and y"),
         ("policy.npz", ["lat,long", "5,5"], "line 2: .*'long': '5'.*, expected lat and lon"),
         ("policy.npz", ["x,y", "5,5", "5"], "seen.csv: line 3: .*, expected x and y"),
-        ("policy.npz", ["x,y"], "seen.csv: no lines, expected a detection"),
+        ("policy.npz", ["x,y"], r"seen.csv: line 2: \{\}, expected x and y"),
         ("policy.npz", ["x,y", "a,b"], "could not convert string to float: 'a'"),
         ("policy.npz", ["id,x,y", "1,5,5", "2,15,5"], "seen.csv: ids 1, 2, expected one target"),
     ],
