@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +55,7 @@ class CsvLogger(RowLogger):
 
     name = "csv"
     _position = 0  # bytes that an earlier process left
+    _columns: Sequence[str] = ()  # of its head
 
     def on_start(self, trainer: Training) -> None:  # noqa: ARG002
         """Open the file; rows of an earlier process after its last checkpoint are cut off.
@@ -63,7 +64,6 @@ class CsvLogger(RowLogger):
             UserError: the file is a link, or not the one that the earlier process left.
         """
         self._path = self._folder / "metrics.csv"
-        names: list[str] = []
         if self._position:
             source = str(self._path)
             with opened(self._path, most=2**36) as stream, decoded(source, "this run's metrics"):
@@ -71,14 +71,12 @@ class CsvLogger(RowLogger):
                 stream.seek(self._position - 1)
                 # A file system without fsync may have lost the last rows; or the file was changed meanwhile, and cut at
                 # this byte it would end in half a row.
-                if names[0] != "iteration" or stream.read(1) != b"\n":
+                if names != self._columns or stream.read(1) != b"\n":
                     at = f"{self._position:,}, where the checkpoint was saved"
-                    raise ValueError(
-                        f"expected a head of columns, and the end of a row at byte {at}"
-                    )
+                    raise ValueError(f"expected its own columns, and the end of a row at byte {at}")
         descriptor = reopen(self._path, empty=not self._position)
         self._file = os.fdopen(descriptor, "r+", newline="", encoding="utf-8")
-        self._writer = csv.DictWriter(self._file, names)
+        self._writer = csv.DictWriter(self._file, self._columns)
         # Rows after the checkpoint are of iterations that are run again: left in place they would stand there twice.
         self._file.truncate(self._position)
         self._file.seek(0, os.SEEK_END)
@@ -103,11 +101,11 @@ class CsvLogger(RowLogger):
         The checkpoint that holds this number is: after a power failure it must not find fewer bytes.
         """
         sync(self._file, self._path)
-        return {"position": self._file.tell()}
+        return {"position": self._file.tell(), "columns": list(self._writer.fieldnames)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Resume the file at the length it had when the state was taken."""
-        self._position = state["position"]
+        self._position, self._columns = state["position"], state["columns"]
 
 
 def known(row: Row) -> dict[str, float | int]:
