@@ -139,6 +139,18 @@ def test_recovering_what_lost_nothing_gives_the_same_bytes(log: Path, tmp_path: 
     assert saved.file.read_bytes() == log.read_bytes()
 
 
+def test_episodes_that_are_there_twice_are_recovered_once(log: Path, tmp_path: Path) -> None:
+    data = log.read_bytes()
+    chunks = [(first, end) for opcode, first, end in regions(log) if opcode == Opcode.CHUNK]
+    (first, end), (_, last) = chunks[0], chunks[-1]
+    twice = tmp_path / "a.mcap"
+    twice.write_bytes(data[:end] + data[first:last] + data[first:])
+    saved = recover(twice)
+    assert saved.damaged
+    with EpisodeReader(log) as whole, EpisodeReader(saved.file) as reader:
+        assert verify(reader) == verify(whole)
+
+
 def test_a_damaged_chunk_costs_only_its_own_episodes(log: Path, tmp_path: Path) -> None:
     chunks = [(first, end) for opcode, first, end in regions(log) if opcode == Opcode.CHUNK]
     assert len(chunks) > 3

@@ -142,9 +142,9 @@ class EpisodeWriter:
         row = self.form.row(episode, tick)
         # Before the first message of the episode: NaN is no JSON, and a time that does not fit into its field makes
         # the Writer raise within a chunk, which finish() could then no longer write.
-        if not (np.isfinite(episode.reward).all() and 0 <= tick < 2**37):
+        if not (np.isfinite(episode.reward).all() and self._tick <= tick < 2**37):
             raise ValueError(
-                f"episode {episode.number}: a reward that is not finite, or a time out of range"
+                f"episode {episode.number}: a reward that is not finite, or times out of order"
             )
         add, channels = self._writer.add_message, self._channels
         steps, grids = self.form.steps(episode), self.form.layers(episode, tick)
