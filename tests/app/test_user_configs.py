@@ -29,8 +29,13 @@ def test_a_config_folder_of_ones_own_adds_choices(
     (tmp_path / "mine/kernel/typo.yaml").write_text("defaults: [random_walk]\nstai: 0.9\n")
     calls = []
     stub(monkeypatch, "train", lambda cfg, folder: calls.append(cfg))
-    assert main(["train", "--config-dir", "../mine", "kernel=slow", "hydra.run.dir=../out"]) == 0
+    (tmp_path / "mine/experiment").mkdir()
+    marked = tmp_path / "mine/experiment/marked.yaml"
+    marked.write_text("# @package _global_\nseed: 7\n", "utf-8-sig")  # with a byte order mark
+    words = ["train", "--config-dir", "../mine", "kernel=slow", "experiment=marked"]
+    assert main([*words, "hydra.run.dir=../out"]) == 0
     assert (calls[0].kernel.name, calls[0].kernel.stay) == ("random_walk", 0.9)
+    assert calls[0].seed == 7
     capsys.readouterr()
     said = refused(capsys, "train", "--config-dir", "../mine", "kernel=slow", "--help")
     assert said.endswith("; --cfg job shows a choice of --config-dir")
@@ -81,6 +86,7 @@ def test_a_config_folder_of_ones_own_adds_choices(
             "not a config",
         ),
         ("experiment/a", "- 1", "experiment=a", "expected a mapping"),
+        ("experiment/a", "defaults: [a]", "experiment=a", "experiment=a: nested too deep, or a"),
         (
             "experiment/a",
             "hydra: {mode: MULTIRUN}",

@@ -11,6 +11,7 @@ from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import OmegaConf
 
 from trackmdp.untrusted import decoded, parse_yaml, read_text
 
@@ -63,7 +64,9 @@ class _UserFolder(FileConfigSource):
             UserError: it is no YAML of plain data.
         """
         file = Path(self.path) / self._normalize_file_name(config_path)
-        if file.is_file():
-            parse_yaml(read_text(file, links=True), str(file))
+        text = read_text(file, links=True)
+        parse_yaml(text, str(file))
         with decoded(str(file), "a config"):
-            return super().load_config(config_path)
+            header = self._get_header_dict(text)
+            source = f"{self.scheme()}://{self.path}"
+            return ConfigResult(self.provider, source, OmegaConf.create(text), header)

@@ -130,6 +130,9 @@ def diagnose(error: Exception, command: str, words: Sequence[str], compose: Comp
             _refuse_wrong(error, command, words, compose)
     except UserError as refusal:
         return refusal
+    if isinstance(error, RecursionError):
+        typed = " ".join(words)[:200]
+        return UserError(f"{typed}: nested too deep, or a file that its own defaults name")
     # No word is at fault: an interpolation, a defaults list or a user's file; Hydra's message is all there is.
     return error if isinstance(error, UserError) else UserError(_plain(error))
 
