@@ -75,12 +75,7 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
             "a sweep of 1,000,000 runs: expected at most 100,000",
         ),
         ("train -m seed=range(0,1,0)", "seed=range(0,1,0): range() arg 3 must not be zero"),
-        ("train seed=range(0,1,0)", "seed=range(0,1,0): range() arg 3 must not be zero"),
         ("train seed=glob(*)", "seed=glob(*): expected the values themselves, separated by commas"),
-        (
-            "train -m algo=glob(*)",
-            "algo=glob(*): expected the values themselves, separated by commas",
-        ),
         ("train seed=${nope:1} seed=-1", "seed=-1: expected an integer >= 0"),
         ("train --sizzle", "unrecognized arguments: --sizzle"),
         ("train --config-dir nowhere", "--config-dir nowhere: no such folder"),
@@ -92,11 +87,9 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         ("evaluate run=", "run=: expected "),
         ("train kernel=table kernel.path=", "kernel.path=: expected a path"),
         ("train seed=${nope}", "seed: Interpolation key 'nope' not found"),
-        ("train ~algo", "algo: missing, expected algo=NAME"),
         ("train ~seed", "~seed: expected seed=value, without + or ~"),
         ("train ~optimal", "~optimal: expected optimal.enabled=value"),
         ("train ~grid", "~grid: expected grid.size=value"),
-        ("train -m ~optimal seed=0,1", "~optimal: expected optimal.enabled=value"),
         ("train kernel=table kernel.path=no.npy", "kernel.path="),
         (
             "train kernel.exit_probability=0",
@@ -110,7 +103,6 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         ("train algo=ppo algo.lr=1", "algo.lr: renamed, expected algo.learning_rate"),
         ("train hydra.run.dir=???", "hydra.run.dir: missing, expected a folder"),
         ("train hydra.run.dir=${nope}", "hydra.run.dir: Interpolation key 'nope' not found"),
-        ("train hydra.run.dir=${nope:1}", "hydra.run.dir: Unsupported interpolation type nope"),
         ("train -m seed=0,1 hydra.sweep.dir=???", "hydra.sweep.dir: missing, expected a folder"),
         ("solve grid.size=3 hydra.run.dir=", "hydra.run.dir=: empty, expected a folder"),
         ("solve -m seed=0,1 hydra.sweep.dir=", "hydra.sweep.dir=: empty, expected a folder"),
@@ -171,7 +163,6 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         (f"train seed={'1' * 5000}", f"seed={'1' * 5000}: expected option=value"),
         (f"train device=cuda:{'9' * 20}", f"device=cuda:{'9' * 20}: no such device"),
         ("train collector.device=cuda:99", "collector.device=cuda:99: no such device"),
-        ("evaluate baseline=qmdp device=cuda:99", "device=cuda:99: no such device"),
         (
             "train hydra.sizzle=1",
             "Could not override 'hydra.sizzle': Key 'sizzle' not in 'HydraConf'",
@@ -201,7 +192,6 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         ("replay file=x recover=true episode=3", "episode=3: without effect with layout= or"),
         ("replay file=x speed=2", "speed=2: without effect where no episode is played"),
         ("replay file=x speed=2 episode=0 verify=true", "speed=2: without effect where no"),
-        ("evaluate run=nowhere task.memory=cell", "task.memory=cell: not together with run="),
         (
             "evaluate baseline=qmdp log=[mcap] episodes=0",
             "episodes=0: expected at least 1 with log=[mcap]",

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from tests.helpers import later
 from tests.typed import ENVIRONMENT, refused, stub
 from trackmdp.app import launch
 from trackmdp.app.cli import main
@@ -61,7 +62,7 @@ def test_closed_streams_are_no_mistake(words: list[str]) -> None:
     assert done.returncode == (2 if "solve" in words else 0)
 
 
-@pytest.mark.parametrize("sweep", [[], ["-m", "hydra.sweep.dir=all"]])
+@pytest.mark.parametrize("sweep", [[], *later([["-m", "hydra.sweep.dir=all"]])])
 def test_letters_that_a_terminal_lacks_are_no_mistake(sweep: list[str], empty_folder: Path) -> None:
     ascii_alone = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     words = ["evaluate", "baseline=none", "grid.size=3", "episodes=5", *sweep]
@@ -191,9 +192,7 @@ def test_ctrl_c_in_the_search_after_training_leaves_a_run_to_resume(
     [
         "solve grid.size=4",
         "train --help",
-        "train --help all",
-        "train --info all",
-        "train --cfg all",
+        *later(["train --cfg all", "train --help all", "train --info all"]),
     ],
 )
 def test_a_full_disk_under_standard_output_is_one_line(words: str, empty_folder: Path) -> None:

@@ -49,8 +49,8 @@ def test_a_world_needs_neither_torch_nor_hydra() -> None:
 
 TRAINED = """
 import trackmdp as tm
-world = tm.make_world(size=3)
-run = tm.train(world, "ppo", total_frames=512, frames_per_batch=256, envs=32)
+world = tm.make_world(size=2)
+run = tm.train(world, "ppo", total_frames=64, frames_per_batch=64, envs=32)
 assert tm.evaluate(world, run.policy).aihtr <= tm.solve(world).upper
 """
 

@@ -89,12 +89,12 @@ def test_the_checks_see_a_broken_link_and_a_missing_file(tmp_path: Path) -> None
     assert missing_files(path, WRITTEN) == ["tests/none.py", "lost.yaml"]
 
 
-OURS = [
-    (path, line)
+OURS = {
+    tuple(words): (path, line)
     for path in DOCUMENTS
     for line in [*commands(path), *inline_commands(path)]
-    if words_of(line) is not None
-]
+    if (words := words_of(line)) is not None
+}.values()
 """Command lines of this package in all documents, in blocks and in the prose."""
 
 

@@ -154,7 +154,7 @@ def test_an_archive_beyond_the_limit_is_refused_before_it_is_unpacked(
 
 def test_every_flipped_bit_of_an_archive_of_arrays_is_found() -> None:
     """One in the length of a comment makes the next array a part of it; times and flags carry no number."""
-    whole = {"a": np.arange(20.0), "b": np.arange(3), "c": np.arange(2)}
+    whole = {"a": np.arange(3.0), "b": np.arange(2)}
     content, numbers = stored(**whole), {name: list(each) for name, each in whole.items()}
     for bit in range(8 * len(content)):
         flipped = bytearray(content)

@@ -18,7 +18,7 @@ from tests.algos.hindsight import (
     learn,
     policy,
 )
-from tests.helpers import algorithm, hop_world, small_world
+from tests.helpers import algorithm, hop_world, later, small_world
 from trackmdp.config import GROUPS
 from trackmdp.config.credit import PerSensorConfig
 
@@ -50,7 +50,7 @@ def test_ppo_draws_sets_only_where_it_is_asked_to() -> None:
     assert not torch.equal(expected, sampled)
 
 
-@pytest.mark.parametrize("name", ["hindsight", "ppo_per_sensor"])
+@pytest.mark.parametrize("name", ["hindsight", *later(["ppo_per_sensor"])])
 def test_prices_are_per_cell(name: str) -> None:
     """The hopping target is worth sensing in the cheap cells only; r = 2, and a miss costs D in the end."""
     world = replace(hop_world(0, safe_cost=0.1), cost=np.array([0.1, 9.0, 0.1, 9.0]))

@@ -50,15 +50,15 @@ BUDGETS = {
     "model_based": "algo.total_frames=20000 algo.frames_per_batch=4000 algo.envs=100",
 }
 """Seconds each; an algorithm that is not here is tried with the options of conf/."""
+QUICK = ("hindsight", "dqn_per_sensor")
+"""Learners that solve a tiny world in the fast tests as well."""
 QUIET = ("quiet=true", "optimal.enabled=false", "evaluation.every=100000")
 
 
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(
-            name, marks=[pytest.mark.slow] * (name in ("a2c", "dqn", "model_based", "ppo"))
-        )
+        pytest.param(name, marks=[pytest.mark.slow] * (name in BUDGETS and name not in QUICK))
         for name in ALGORITHMS
     ],
 )
@@ -141,7 +141,7 @@ def tiny(name: str) -> list[str]:
     }
     if issubclass(GROUPS["algo"][name], PerSensorConfig):
         small[name] = "algo.updates=6 algo.batch_size=256 algo.hidden=16"
-    budget = ["algo.total_frames=3072", "algo.frames_per_batch=1024", "algo.envs=64"]
+    budget = ["algo.total_frames=768", "algo.frames_per_batch=256", "algo.envs=32"]
     return [*QUIET, *WORLD, *budget, *small.get(name, "").split()]
 
 

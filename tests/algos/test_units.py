@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import trackmdp as tm
-from tests.helpers import ALGORITHMS, headings, small_world
+from tests.helpers import ALGORITHMS, headings, later, small_world
 
 UNITS = (2.0**-40, 2.0**20)
 FEW: dict[str, Any] = {"total_frames": 1024, "frames_per_batch": 256, "envs": 32}
@@ -49,7 +49,10 @@ def test_of_moves(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "options"),
-    [("hindsight", CREDIT), ("model_based", FEW | {"estimate": "paths", "total_frames": 2048})],
+    [
+        ("hindsight", CREDIT),
+        *later([("model_based", FEW | {"estimate": "paths", "total_frames": 2048})]),
+    ],
 )
 def test_of_whole_paths(name: str, options: dict[str, Any]) -> None:
     check(headings(memory="displacement", markov=False), name, **options)

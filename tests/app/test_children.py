@@ -27,8 +27,8 @@ TRAIN = (
 RAY = [installed("ray"), pytest.mark.slow]
 LINES = [
     f"{SOLVE}basic",
-    pytest.param(f"{SOLVE}joblib", marks=installed("joblib")),
-    pytest.param(f"{SOLVE}submitit_local", marks=installed("submitit")),
+    pytest.param(f"{SOLVE}joblib", marks=[installed("joblib"), pytest.mark.slow]),
+    pytest.param(f"{SOLVE}submitit_local", marks=[installed("submitit"), pytest.mark.slow]),
     BLOCKS,
     pytest.param(f"{TRAIN}multi_sync", marks=pytest.mark.slow),
     pytest.param(f"{TRAIN}multi_async", marks=pytest.mark.slow),

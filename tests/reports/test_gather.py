@@ -347,7 +347,9 @@ def test_a_folders_name_is_a_name_everywhere(
     save_results(gather_runs(sweep), tmp_path)
     found = load_results(tmp_path)
     assert len(found.runs) == 12
-    report = build(dataclasses.replace(found, manifest={**found.manifest, "line": "".join(EVIL)}))
+    report = build(
+        dataclasses.replace(found, manifest={**found.manifest, "line": "".join(EVIL)}, maps=[])
+    )
     page = report.html()
     assert "<script>alert" not in page
     assert page.count("</body>") == 1

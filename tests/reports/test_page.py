@@ -286,14 +286,15 @@ def test_without_a_solver_a_bound_counts_as_attained_only_where_a_learned_policy
     assert f'data-v="{best!r}"' in text
 
 
-def test_runs_of_an_earlier_line_count_as_planned_but_copies_do_not(sweep: Path) -> None:
-    shutil.copytree(sweep / "a2c-0.22-0", sweep / "z")
-    names = sorted(path.name for path in sweep.iterdir())
-    plan(sweep, *names[:2], "ppo-0.16-0")  # the second line, in the folder of the first
-    page = build(gather_runs(sweep)).html()
-    assert "12 of 13 planned runs" in page
+def test_runs_of_an_earlier_line_count_as_planned_but_copies_do_not(tmp_path: Path) -> None:
+    for seed in range(2):
+        write_run(tmp_path / str(seed), "grid.size=3", seed=seed)
+    shutil.copytree(tmp_path / "0", tmp_path / "z")
+    plan(tmp_path, "0", "ppo")  # the second line, in the folder of the first
+    page = build(replace(gather_runs(tmp_path), maps=[])).html()
+    assert "2 of 3 planned runs" in page
     assert "<dt>Last command</dt>" in page
-    plan(sweep, *names[:12])
-    page = build(gather_runs(sweep)).html()
-    assert "12 of 12 planned runs" in page
+    plan(tmp_path, "0", "1")
+    page = build(replace(gather_runs(tmp_path), maps=[])).html()
+    assert "2 of 2 planned runs" in page
     assert "<dt>Command</dt>" in page

@@ -25,7 +25,9 @@ def test_brute_force_over_all_sets_lies_in_the_bracket(seed: int) -> None:
 
 
 def test_bound_and_figures_are_those_of_the_same_sets_without_a_window() -> None:
-    world = tm.make_world("random_support", size=4, support_size=3, cost=0.2, t_max=1, seed=3)
+    world = tm.make_world(
+        "random_support", size=3, support_size=3, exit_probability=0.05, cost=0.2, t_max=1, seed=3
+    )
     near, plain = (Group([world.but(window=each)] * 2) for each in (1, None))
     found = tm.solve(near)
     assert found.upper == pytest.approx(tm.solve(plain).upper, abs=1e-12)
@@ -44,11 +46,14 @@ def test_all_on_unites_the_windows_of_all_targets() -> None:
 
 
 def test_environment_simulation_tracker_and_log_agree(tmp_path: Path) -> None:
-    group = Group([tm.make_world("random_walk", size=5, cost=0.2, t_max=1, window=1)] * 2)
+    group = Group(
+        [tm.make_world("random_walk", size=4, exit_probability=0.05, cost=0.2, t_max=1, window=1)]
+        * 2
+    )
     rule = tm.solve(group).policy
-    episodes = tm.simulate(group, rule, 4)
+    episodes = tm.simulate(group, rule, 2)
     groups.check_steps(group, episodes, rule)
-    assert tm.TrackEnv(group, 3).rollout(2, rule)["action"].shape == (3, 2, 25)
+    assert tm.TrackEnv(group, 3).rollout(2, rule)["action"].shape == (3, 2, 16)
     for episode in episodes:
         assert len(list(groups.tracked(rule, episode))) == len(episode)
     with EpisodeReader(groups.write(tmp_path / "a.mcap", episodes.complete(), rule)) as reader:

@@ -132,7 +132,7 @@ def check_values(problem: Problem, seed: int, draws: bool) -> None:
         close(getattr(found, name), expected)
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(problems(), st.integers(0, 2**16), st.booleans())
 def test_values_are_those_of_the_chain(problem: Problem, seed: int, draws: bool) -> None:
     check_values(problem, seed, draws)
@@ -155,7 +155,7 @@ def test_values_do_not_depend_on_how_many_events_are_followed_at_once(
         check_values(problem, seed, draws=False)
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(problems(), st.integers(0, 2**16))
 def test_searches_value_policies_as_evaluation_does(problem: Problem, seed: int) -> None:
     """And plans of all keys, each event weighted by its visits, are worth the visits times the value."""
@@ -177,7 +177,7 @@ def test_searches_value_policies_as_evaluation_does(problem: Problem, seed: int)
     )
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(problems(tracks=False), st.integers(0, 2**16))
 def test_bounds_are_those_of_the_definition_and_above_every_policy(world: World, seed: int) -> None:
     bound, expected = bounds.clocked(world), clocked(world)
@@ -200,7 +200,7 @@ def test_bounds_are_those_of_the_definition_and_above_every_policy(world: World,
 TINY: dict[str, Any] = {"limits": (None,), "tracks": False, "most": 3}
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(
     st.one_of(
         problems(**TINY, sizes=((1, 3), (2, 2)), t_max=1, modes=(1,)),

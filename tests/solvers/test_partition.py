@@ -80,7 +80,7 @@ def test_footprints_are_cut_to_a_rectangle() -> None:
 @pytest.mark.parametrize(
     "options",
     [
-        {"budget": 2, "window": 2},
+        pytest.param({"budget": 2, "window": 2}, marks=pytest.mark.slow),
         {"spacing": 1, "budget": 1, "window": 3, "t_max": 0},  # wider than the halo of a move
         pytest.param({"spacing": 2}, marks=pytest.mark.slow),
         pytest.param({"spacing": 2, "detection": 0.8, "budget": 2}, marks=pytest.mark.long),
@@ -110,7 +110,7 @@ def test_the_reach_is_that_of_the_longest_move() -> None:
     assert reach(World(kernel, 4, cost=0.1, t_max=0)) == 2
 
 
-@pytest.mark.parametrize(("cost", "t_max"), [(0.16, 1), (0.22, 2)])
+@pytest.mark.parametrize(("cost", "t_max"), [(0.16, 1), *later([(0.22, 2)])])
 def test_with_the_default_halo_blocks_lose_nothing_and_without_one_they_do(
     cost: float, t_max: int
 ) -> None:

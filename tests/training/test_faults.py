@@ -145,9 +145,8 @@ def test_a_loss_that_is_not_finite_names_the_iteration_and_leaves_the_last_good_
     [
         (signal.SIGTERM, 3),
         (signal.SIGINT, 3),
-        (signal.SIGUSR1, 3),
-        (signal.SIGHUP, 3),
         (signal.SIGTERM, 8),
+        *later([(signal.SIGUSR1, 3), (signal.SIGHUP, 3)]),
     ],
 )
 def test_a_signal_ends_the_run_after_its_iteration_is_saved(

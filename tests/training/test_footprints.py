@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import trackmdp as tm
-from tests.helpers import small_world
+from tests.helpers import later, small_world
 from trackmdp.errors import UserError
 from trackmdp.sensing.coverage import discs
 from trackmdp.world.model import World
@@ -42,7 +42,7 @@ def test_sets_of_sensors_are_learned_and_kept(algo: str, tmp_path: Path) -> None
     assert (again.policy.dense() == run.policy.dense()).all()
 
 
-@pytest.mark.parametrize("algo", ["a2c", "dqn", "model_based"])
+@pytest.mark.parametrize("algo", ["a2c", "model_based", *later(["dqn"])])
 def test_a_budget_is_kept_to_by_sensors_that_share_cells(algo: str) -> None:
     world = _world().but(budget=1)
     run = tm.train(world, algo, **SHORT)

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 
+from tests.helpers import later
 from tests.training.runs import train
 from tests.training.test_state import forged
 from trackmdp.app.cli import main
@@ -26,10 +27,22 @@ def as_type(state: Any, kind: torch.dtype) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("algo", "part"),
-    [("ppo", "policy"), ("dqn", "loss"), ("dqn", "buffer"), ("hindsight", "learner")],
+    ("algo", "part", "kind"),
+    [
+        ("ppo", "policy", torch.float64),
+        ("dqn", "loss", torch.complex64),
+        ("dqn", "buffer", torch.float64),
+        ("hindsight", "learner", torch.complex64),
+        *later(
+            [
+                ("dqn", "loss", torch.float64),
+                ("ppo", "policy", torch.complex64),
+                ("dqn", "buffer", torch.complex64),
+                ("hindsight", "learner", torch.float64),
+            ]
+        ),
+    ],
 )
-@pytest.mark.parametrize("kind", [torch.float64, torch.complex64])
 def test_numbers_of_another_type_are_refused_in_one_line(
     algo: str, part: str, kind: torch.dtype, tmp_path: Path, capfd: Any
 ) -> None:

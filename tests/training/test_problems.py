@@ -56,10 +56,7 @@ PROBLEMS: dict[str, Problem] = {
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(name, marks=[] if name in ("modes", "footprints") else pytest.mark.slow)
-        for name in PROBLEMS
-    ],
+    [pytest.param(name, marks=[pytest.mark.slow] * (name != "modes")) for name in PROBLEMS],
 )
 def test_a_problem_from_python_is_used_by_every_command(name: str, tmp_path: Path) -> None:
     problem = PROBLEMS[name]

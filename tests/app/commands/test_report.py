@@ -21,7 +21,7 @@ from trackmdp.training.lock import is_locked
 
 @pytest.fixture(scope="module")
 def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_sweep(tmp_path_factory.mktemp("sweep"))
+    return write_sweep(tmp_path_factory.mktemp("sweep"), 0.16)
 
 
 @pytest.fixture(autouse=True)
@@ -51,16 +51,16 @@ def test_a_report_holds_page_figures_tables_and_what_it_was_made_from(
     monkeypatch.setattr(report, "save_results", saved)
     assert main(["report", f"sweep={sweep}"]) == 0
     assert held == [True]  # one report at a time is written to a folder
-    assert capsys.readouterr().out == f"12 runs; report in {sweep / 'report/report.html'}\n"
+    assert capsys.readouterr().out == f"6 runs; report in {sweep / 'report/report.html'}\n"
     made = contents(sweep / "report")
     tables = {f"tables/outcome.{ending}" for ending in ("csv", "tex")} | {"tables/runs.csv"}
     assert made.keys() >= tables | {"report.html", "results.npz"}
-    assert made.keys() >= {f"figures/aihtr-z-5.{ending}" for ending in ("svg", "png", "csv")}
+    assert made.keys() >= {f"figures/learning-frames.{ending}" for ending in ("svg", "png", "csv")}
     rows = list(csv.DictReader(made["tables/runs.csv"].decode().splitlines()))
     assert {row["folder"] for row in rows} == {path.name for path in sweep.iterdir()} - {"report"}
     assert b"the paper" not in made["report.html"].lower()
 
-    assert len(run_folders(sweep, None)) == 12  # the report that lies there is no run
+    assert len(run_folders(sweep, None)) == 6  # the report that lies there is no run
 
     # sweeps are reported one by one; from what a report keeps, and from nothing else, the same one is made again
     line = ["report", "-m", f"sweep={sweep},{sweep}/report", "quiet=true", "hydra.sweep.dir=all"]
@@ -79,7 +79,7 @@ def test_a_missing_run_is_named_in_one_line_and_in_the_page(
     assert main(["report", f"sweep={cut}"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == ("missing or mixed, the first of 2: a2c-0.16-0: cut: it has no summary.json")
-    assert lines[1].startswith("10 runs; report in")
+    assert lines[1].startswith("4 runs; report in")
     page = (cut / "report/report.html").read_text(encoding="utf-8")
     assert "a2c-0.16-1" in page
 
@@ -122,8 +122,8 @@ def test_a_finished_sweep_is_watched_at_once(
 ) -> None:
     assert main(["report", f"sweep={sweep}", "watch=true"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 13
-    assert lines[-1] == "12 runs: 12 done"
+    assert len(lines) == 7
+    assert lines[-1] == "6 runs: 6 done"
     assert all(", gap " in line for line in lines[:-1])
 
 

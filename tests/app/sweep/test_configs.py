@@ -43,14 +43,14 @@ def composer() -> Iterator[Composer]:
     ("words", "calls"),
     [
         ("seed=range(3)", 1),
-        ("seed=0,1 cost.sensor=0.1,1,0.3", 1),
-        ("algo=ppo,a2c seed=0,1 algo.gamma=0.9,0.95", 2),
+        ("seed=0,1 cost.sensor=0.1,1", 1),
+        ("algo=ppo,a2c algo.gamma=0.9,0.95", 2),
         ("log=[csv] log.csv.every=1,2", 1),
-        ("optimal.enabled=true,false seed=0,1", 1),
+        ("optimal.enabled=true,false", 1),
         ("algo.total_frames=20000,40000", 1),  # those of the collector follow
         ("kernel.support_size=3,4", 1),  # the kernel's seed follows
-        ("grid.size=3,4,[3,4]", 2),
-        ("cost.safe=3,null,4.5", 2),
+        ("grid.size=3,[3,4]", 2),
+        ("cost.safe=3,null,4", 2),
         ("kernel=drift,random_walk seed=0,1", 2),
     ],
 )

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from tests.app.sweep.runs import TINY, here, runs_of, states, swept, table
+from tests.helpers import later
 from tests.typed import stub
 from trackmdp.app.cli import main
 from trackmdp.errors import Preempted, adding
@@ -54,9 +55,9 @@ def trials(folder: Path) -> list[tuple[float, int, int, float]]:
 
 def test_words_with_many_values_are_searched(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stub(monkeypatch, "train", peak)
-    assert searched("hydra.sweeper.n_trials=6") == 0
+    assert searched("hydra.sweeper.n_trials=4") == 0
     found = trials(here / "all")
-    assert len(found) == 6
+    assert len(found) == 4
     assert all(
         0.5 <= gamma <= 0.9 and size % 8 == 0 and 8 <= size <= 64 for gamma, size, _, _ in found
     )
@@ -166,8 +167,8 @@ def test_after_a_failed_trial_another_one_is_tried(here: Path) -> None:
     "other",
     [
         ["grid.t_max=2"],  # another world
-        ["hydra.sweeper.objective=regret_per_step"],
         [],  # the same, yet runs of the study were removed
+        *later([["hydra.sweeper.objective=regret_per_step"]]),
     ],
 )
 def test_a_study_of_other_runs_does_not_go_on(
