@@ -111,7 +111,7 @@ def test_a_new_sensor_and_a_new_memory_work_in_every_command(
     kernel: str, site: Path, tmp_path: Path
 ) -> None:
     """Sensors that see less far away and the gap between detections: solved, learned, simulated, logged, replayed."""
-    few = "collector.total_frames=10000 evaluation.every=1 algo=a2c optimal.enabled=false"
+    few = "algo=a2c algo.total_frames=2048 evaluation.every=1 optimal.enabled=false"
     new = NEW + kernel
     lines = (
         f"solve {new} hydra.run.dir=solved",

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.helpers import later
 from tests.typed import refused
 from trackmdp.app.cli import main
 from trackmdp.episodes.differences import first_difference
@@ -132,7 +133,7 @@ def logged(folder: Path, *words: str) -> EpisodeReader:
     [
         ["baseline=optimal", "task.memory=displacement", "task.clip=1"],
         ["baseline=optimal", "kernel.reveals=true", "sensor=miss", "sensor.p_d=0.8"],
-        ["baseline=all_on"],
+        *later([["baseline=all_on"]]),
     ],
     ids=["remembered", "told", "all_on"],
 )

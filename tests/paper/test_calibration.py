@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from trackmdp.config import conf_dir
+from trackmdp.paper import proofs
 from trackmdp.paper.calibration import Candidate, candidates, checks, chosen, sensitivity
 from trackmdp.paper.worlds import (
     COSTS,
@@ -98,6 +99,13 @@ def test_the_sensitivity_is_the_range_over_the_draws() -> None:
         s.accuracy.median for s in settings if (s.border, s.t_max, s.cost) == ("inside", 1, 0.16)
     ]
     assert max(inside) - min(inside) < 1e-9  # the same for every Z, so the paper did not use it
+
+
+def test_the_theorems_hold_on_the_papers_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(proofs, "of_searches", lambda: iter(()))  # of other worlds, and slow
+    rows = checks(39)
+    assert all(row.passed for row in rows)
+    assert {"Theorem 3, exact form", "the printed bound"} <= {row.name for row in rows}
 
 
 def test_ctrl_c_in_the_search_checks_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from tests.episodes.browser import CHROMIUM, Browser
 from tests.reports.sweeps import plan, write_run
 from tests.tracks import by_hand, recorded
 from trackmdp.config.compose import compose
-from trackmdp.paper.calibration import Openings, candidates, checks, sensitivity
+from trackmdp.paper.calibration import Openings, load_openings
 from trackmdp.paper.sections import accuracy_table, sections
 from trackmdp.paper.worlds import pairs
 from trackmdp.reports.gather import gather_runs
@@ -44,13 +44,14 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
                 )
     found = gather_runs(folder)
     found.anomalies.append(Anomaly("</script><b>", "cut & gone"))  # type: ignore[attr-defined]
-    return found
+    return replace(found, maps=found.maps[:2])
 
 
 @pytest.fixture(scope="module")
 def openings() -> Openings:
-    every = [candidate for z in (3, 4, 5) for candidate in candidates(z, seeds=range(2))]
-    return Openings(every, list(sensitivity(draws=[0])), checks(39))
+    kept = load_openings(Path(__file__).parents[1] / "data/paper")
+    assert kept
+    return kept
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ import pytest
 import torch
 from scipy import sparse
 
-from tests.helpers import ALGORITHMS, algorithm, collect, limited, small_world
+from tests.helpers import ALGORITHMS, algorithm, collect, later, limited, small_world
 from tests.tracks import by_hand, drawn, recorded, write
 from tests.training.runs import rows as metrics
 from tests.training.runs import tensors
@@ -198,7 +198,7 @@ def test_a_run_says_nothing_that_takes_a_kernel(file: Path, tmp_path: Path) -> N
     assert [len(part) for part in (kept.tracks, kept.validation, kept.held_out)] == [42, 6, 12]
 
 
-@pytest.mark.parametrize("algo", ["hindsight", "ppo"])
+@pytest.mark.parametrize("algo", ["hindsight", *later(["ppo"])])
 def test_only_its_own_part_is_learned_from(algo: str, runs: Callable[[str], Path]) -> None:
     """Other cells in the held-out or the validation tracks, and the run learns the same; in the others, it does not."""
     folder = runs(algo)

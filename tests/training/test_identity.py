@@ -12,7 +12,7 @@ import pytest
 import torch
 from torchrl.collectors import Collector
 
-from tests.helpers import small_world
+from tests.helpers import later, small_world
 from tests.training.runs import assert_same_run, at_iteration, breaks, tensors, train
 from trackmdp.algos.moves import MoveBuffer
 from trackmdp.errors import Preempted, RunError, UserError
@@ -43,7 +43,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("cuts", [(3, 5), (8,)])
+@pytest.mark.parametrize("cuts", [(3, 5), *later([((8,),)])])
 def test_the_best_does_not_depend_on_where_a_run_was_cut(
     cuts: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: Path
 ) -> None:
@@ -83,7 +83,7 @@ def test_the_best_is_the_policy_that_it_was_called_the_best_for(whole: Path) -> 
     assert figures[0]["best"] == figures[1]["best"]
 
 
-@pytest.mark.parametrize("name", [checkpoint.LAST, checkpoint.BEST])
+@pytest.mark.parametrize("name", [checkpoint.BEST, *later([checkpoint.LAST])])
 def test_a_run_cut_between_a_checkpoint_and_its_names_is_the_same(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: Path
 ) -> None:

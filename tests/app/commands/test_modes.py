@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.helpers import later
 from trackmdp.app.cli import main
 from trackmdp.config.compose import compose
 from trackmdp.policies.table import PolicyTable
@@ -122,7 +123,7 @@ def test_large_systems_are_iterated_to_the_same_value(monkeypatch: pytest.Monkey
 @pytest.mark.usefixtures("little_search")
 @pytest.mark.parametrize(
     "kernel",
-    ["regimes", "constant_velocity", pytest.param("coordinated_turn", marks=pytest.mark.slow)],
+    ["regimes", *later(["constant_velocity", "coordinated_turn"])],
 )
 def test_every_kernel_is_solved_and_simulated(kernel: str, here: Path) -> None:
     """By the command line, hidden and told: exact = simulated within 3 standard errors, and never above the bound."""

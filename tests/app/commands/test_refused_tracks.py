@@ -9,13 +9,21 @@ import numpy as np
 import pytest
 
 from tests.app.commands.test_tracks import CITY, folder
+from tests.helpers import later
 from tests.typed import refused
 from trackmdp.config import GROUPS
 
 __all__ = ["folder"]
 
 
-NEEDS_THE_MODEL = sorted(set(GROUPS["baseline"]) - {"all_on", "none", "random_k", "sets"})
+NEEDS_THE_MODEL = sorted(
+    set(GROUPS["baseline"]) - {"all_on", "none", "random_k", "sets", "playback", "optimal"}
+)
+
+
+def refused_baseline(name: str) -> tuple[str, str, str]:
+    expected = "expected one of all_on, none, random_k, sets with kernel=tracks"
+    return "evaluate", f"baseline={name}", f"baseline={name}: {expected}"
 
 
 @pytest.mark.parametrize(
@@ -48,15 +56,8 @@ NEEDS_THE_MODEL = sorted(set(GROUPS["baseline"]) - {"all_on", "none", "random_k"
         ),
         ("train", "kernel.step=5", "kernel.step=5: only for positions; kernel.path="),
         ("train", "grid.size=4 kernel.min_length=null", "kernel.path="),
-        *(
-            (
-                "evaluate",
-                f"baseline={name}",
-                f"baseline={name}: expected one of all_on, none, random_k, sets with kernel=tracks",
-            )
-            for name in NEEDS_THE_MODEL
-            if name != "playback"
-        ),
+        refused_baseline("optimal"),
+        *later(refused_baseline(name) for name in NEEDS_THE_MODEL),
     ],
 )
 def test_what_cannot_be_is_refused(
@@ -93,7 +94,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-@pytest.mark.parametrize("command", ["train", "evaluate"])
+@pytest.mark.parametrize("command", ["train", *later(["evaluate"])])
 def test_a_bad_file_is_refused_before_anything_is_written(
     command: str, case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
