@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import gc
-import importlib.metadata
 import os
 import signal
-from functools import cache
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -21,8 +19,6 @@ from hypothesis import settings
 from trackmdp.solvers import hidden
 
 torch.set_num_threads(1)
-# Read from files by each checkpoint, of packages that nothing changes meanwhile.
-importlib.metadata.version = cache(importlib.metadata.version)
 # A shell's job in the background ignores Ctrl-C, one behind `nohup` hangups, and so would all programs that a test
 # starts from it.
 signal.signal(signal.SIGINT, signal.default_int_handler)

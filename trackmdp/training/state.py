@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from importlib.metadata import version
+from functools import cache
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ PACKAGES = ("torch", "torchrl", "tensordict", "hydra-core", "numpy", "scipy")
 _NOT_WEIGHTS = {"optimizer", "buffer", "generator", "explore", "unit"}
 """Parts of a state that are not learned: how much is explored, and the prices in which `AdditiveQ` counts, are the new
 run's own."""
+version = cache(metadata.version)  # read from files, which each checkpoint would do again
 _SAVING = 50  # seconds of training to one of saving, at least
 
 
