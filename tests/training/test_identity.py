@@ -43,7 +43,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("cuts", [(3, 5), *later([((8,),)])])
+@pytest.mark.parametrize("cuts", [(3, 5), pytest.param((8,), marks=pytest.mark.slow)])
 def test_the_best_does_not_depend_on_where_a_run_was_cut(
     cuts: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: Path
 ) -> None:
@@ -178,19 +178,24 @@ def test_what_another_run_left_is_not_taken(
         {"collector": {"environment": {"rows": {}, "generators": {}}}},
         {"random": {}},
         {"callbacks": {"csv": {"position": 10**15, "columns": []}}},
+        lambda saved: {
+            "callbacks": saved["callbacks"]
+            | {"csv": saved["callbacks"]["csv"] | {"position": 10**4}}  # beyond its end
+        },
         {"callbacks": [1]},
         {"position": {"iteration": 8, "frames": 2000, "steps": 3}},
         {"callbacks": {"checkpoints": {"best": "x"}}},
     ],
 )
 def test_a_sealed_state_that_makes_no_sense_is_refused_in_one_line(
-    damage: dict[str, Any], tmp_path: Path, whole: Path
+    damage: dict[str, Any] | Callable[[Any], dict[str, Any]], tmp_path: Path, whole: Path
 ) -> None:
     mine = tmp_path / "mine"
     shutil.copytree(whole, mine)
     saved = checkpoint.load(checkpoint.newest(mine))
     shutil.rmtree(mine / "checkpoints")
-    checkpoint.save(mine / "checkpoints", 8, {**saved, **damage}, keep=1)
+    changed = damage(saved) if callable(damage) else damage
+    checkpoint.save(mine / "checkpoints", 8, {**saved, **changed}, keep=1)
     (mine / "summary.json").unlink()
     before = (mine / "metrics.csv").read_bytes()
     with pytest.raises(UserError) as refused:
