@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -69,4 +70,4 @@ class _UserFolder(FileConfigSource):
         with decoded(str(file), "a config"):
             header = self._get_header_dict(text)
             source = f"{self.scheme()}://{self.path}"
-            return ConfigResult(self.provider, source, OmegaConf.create(text), header)
+            return ConfigResult(self.provider, source, OmegaConf.load(io.StringIO(text)), header)

@@ -204,13 +204,12 @@ def _chosen_columns(names: Iterable[str], own: Sequence[str]) -> dict[str, str]:
     """
     lowered = [name.strip().lower() for name in names]
     known = dict(zip(lowered, names, strict=True))
-    usual = ALIASES | {
-        name: (column.lower(),) for name, _, column in (each.partition(":") for each in own)
-    }
+    given = {name: (each.lower(),) for name, _, each in (pair.partition(":") for pair in own)}
+    usual = ALIASES | given
     there = ((ours, each) for ours in usual for each in reversed(usual[ours]) if each in known)
     found = {name: known[each] for name, each in there}  # the first one is the last set
-    pairs = [pair for pair in (("x", "y"), ("lon", "lat")) if found.keys() >= {*pair}]  # or both
-    pairs = [pair for pair in pairs if {each.partition(":")[0] for each in own} & {*pair}] or pairs
+    pairs = [pair for pair in (("x", "y"), ("lon", "lat")) if found.keys() >= {*pair}]
+    pairs = [pair for pair in pairs if given.keys() & {*pair}] or pairs  # a file may have both
     missing = [
         f"{name} ({', '.join(usual[name][:3])})" for name in ("id", "time") if name not in found
     ]

@@ -90,8 +90,9 @@ def swept_figure(study: Study, panel: Panel) -> Figure | None:
     policy may lie above it, as D is paid as well.
     """
     title, worlds = panel
-    every = {method: _learned(study, worlds, method) for method in study.methods}
-    learned = {method: places for method, places in every.items() if places}
+    learned = {
+        method: places for method in study.methods if (places := _learned(study, worlds, method))
+    }
     best = [
         _Place(price, *(study.reference(world, "best known", key) for key in _PLANE))
         for price, world in worlds.items()
