@@ -353,6 +353,15 @@ def test_the_first_line_names_the_estimate(here: Path, capsys: pytest.CaptureFix
         (["algo.sensing=all", "cost.budget=1"], "expected chosen or null with cost.budget=1"),
         (["algo.warm_up=1", "cost.budget=1"], "algo.warm_up=1: without effect with cost.budget"),
         (["algo.estimate=moves", "algo.prior=2"], "without effect with algo.estimate=moves"),
+        (["algo.gamma=0.5"], "algo.gamma=0.5: without effect with kernel=random_support"),
+        (
+            ["algo.prior=2", "kernel=heading", "kernel.reveals=true"],
+            "algo.prior=2: without effect with kernel=heading",
+        ),
+        (
+            ["algo.estimate=paths", "algo.share_cells=all"],
+            "algo.share_cells=all: without effect with algo.estimate=paths",
+        ),
         (["task.clip=3"], "task.clip=3: without effect with task.memory=cell"),
         (
             ["kernel=heading", "kernel.reveals=true", "algo.share_cells=all"],
@@ -365,6 +374,14 @@ def test_options_without_a_meaning_are_refused(
 ) -> None:
     assert expected in refused(capsys, "train", *words)
     assert not list(here.iterdir())
+
+
+def test_plans_on_moves_of_a_given_problem_have_no_prior() -> None:
+    few: Any = {"prior": 2, "total_frames": 200, "frames_per_batch": 100, "envs": 10}
+    world = small_world(2)
+    with pytest.raises(UserError, match="prior=2: without effect with kernel=given, of pooled"):
+        tm.train(world, "model_based", **few)
+    assert tm.train(world.but(markov=False), "model_based", **few).policy.task.markov is False
 
 
 @pytest.mark.parametrize("frames", [2, 4])

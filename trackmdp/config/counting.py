@@ -80,13 +80,19 @@ class ModelBasedConfig(EveryTaskConfig):
             )
 
     def ignored(self, root: Any) -> Reasons:
-        """All sensors are on before chosen sets, if a budget allows it; moves have no prior of keys."""
-        found, limited = {}, root.cost.budget is not None
+        """A budget allows no first steps with all sensors on; moves have no prior of keys, paths no classes."""
+        found, limited, kernel = {}, root.cost.budget is not None, root.kernel
         if limited or self.sensing != "chosen":
             why = "cost.budget" if limited else f"algo.sensing={self.sensing or 'null'}"
             found["warm_up"] = f"with {why}"
-        if self.estimate == "moves":
-            found |= dict.fromkeys(("prior", "gamma"), "with algo.estimate=moves")
+        markov = getattr(kernel, "markov", not kernel.hides or kernel.reveals)
+        if self.estimate == "moves" or (self.estimate is None and markov):
+            why = (
+                "algo.estimate=moves" if self.estimate else f"kernel={kernel.name}, of pooled moves"
+            )
+            found |= dict.fromkeys(("prior", "gamma"), f"with {why}")
+        elif self.estimate == "paths" and not self.chooses(root.cost.budget):
+            found["share_cells"] = "with algo.estimate=paths and all sensors on"
         return found
 
     def needs(self, task: Any, root: Any) -> Needs:

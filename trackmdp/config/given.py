@@ -20,6 +20,7 @@ class GivenKernelConfig(HiddenKernelConfig):
     modes: int = count_option("hidden modes of the target", unit="modes")
     digest: str = option("of the problem, so that runs of two problems stay apart", expects=_SET)
     reveals: bool = option("whether a detection reveals the mode as well", expects=_SET)
+    markov: bool = option("whether the next move depends on a detection alone", expects=_SET)
 
     @property
     def is_motion(self) -> bool:  # type: ignore[override]  # a class attribute of the other kernels

@@ -91,6 +91,7 @@ def words_of(given: Subject, folder: Path | None, subject: Subject | None = None
         "kernel.motion": problem.model is not None,
         "kernel.modes": getattr(problem, "modes", 1),
         "kernel.reveals": problem.revealed > 1,
+        "kernel.markov": problem.markov,
         "kernel.digest": problem_digest(subject or given)[:16],
     }
 
