@@ -61,6 +61,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "algo.learning_rat: unknown option, did you mean algo.learning_rate",
     ),
     ({"sead": 1}, "sead: unknown option, did you mean seed? (known: quiet, "),
+    ({"kernel.digest": "x"}, "kernel.digest: unknown option"),  # of kernel=given
     ({"seed": "abc"}, "seed=abc: expected an integer >= 0"),
     ({"grid.size": 0}, "grid.size=0: expected an integer >= 1"),
     ({"algo": "ppo", "algo.minibatches": 3}, "algo.minibatches=3: expected a divisor"),

@@ -70,9 +70,10 @@ def unknown_option(key: str, known: Mapping[str, Option]) -> UserError:
     group, _, name = key.partition(".")
     choice, _, own = name.partition(".")
     beneath = choice if f"{group}.{own}" not in known else None
+    schemas = {each: GROUPS[group][each] for each in typed_choices(group)}
     others = [
         each
-        for each, schema in GROUPS.get(group, {}).items()
+        for each, schema in schemas.items()
         if name in options(schema) or (each == beneath and own in options(schema))
     ]
     if full := next((x for each in others if (x := f"{group}.{each}.{name}") in known), None):
@@ -85,7 +86,6 @@ def unknown_option(key: str, known: Mapping[str, Option]) -> UserError:
     beside = [each for each in known if each.startswith(parent)]
     first = dict.fromkeys(each.split(".")[0] for each in known)
     # `algo.epoch` may mean an option of another algorithm than the one chosen; `log` has those of all that are chosen.
-    schemas = GROUPS.get(group, {})
     several = any(each.split(".")[1] in schemas for each in beside)
     others = [] if several else [f"{group}.{x}" for each in schemas.values() for x in options(each)]
     return UserError(f"{key}: unknown option{suggestion(key, [*known, *others], beside or first)}")

@@ -178,7 +178,7 @@ GROUPS: dict[str, dict[str, type[Any]]] = {}
 
 def typed_choices(group: str) -> list[str]:
     """The choices of a group but `given`, which stands for a problem made in Python and cannot be typed."""
-    return [name for name in GROUPS[group] if name != "given"]
+    return [name for name in GROUPS.get(group, {}) if name != "given"]
 
 
 @dataclass(frozen=True)
