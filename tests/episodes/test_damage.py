@@ -277,6 +277,10 @@ def test_recover_refuses_what_it_cannot_save(tmp_path: Path, log: Path) -> None:
     file.write_bytes(headless)
     with pytest.raises(UserError, match="too damaged"):
         recover(file)
+    first = next(start for opcode, start, _ in regions(log) if opcode == Opcode.CHUNK)
+    file.write_bytes(log.read_bytes()[:first])
+    with pytest.raises(UserError, match="holds no whole episode; the end is missing"):
+        recover(file)
     assert [each.name for each in tmp_path.iterdir()] == ["a.mcap"]
     file.write_bytes(log.read_bytes())
     recover(file)

@@ -34,7 +34,7 @@ def recover(file: Path) -> Recovered:
     """Write every whole episode of `file` to a new one beside it; `file` stays as it is.
 
     Raises:
-        UserError: not a log of this format, or its first part is lost, or the new file already exists.
+        UserError: not a log of this format, or its first part or every episode is lost, or the new file already exists.
     """
     # `runs/episodes.recovered.mcap` for `runs/episodes.mcap` and for `runs/episodes.mcap.part`
     target = file.with_name(f"{Path(file.name.removesuffix('.part')).stem}.recovered.mcap")
@@ -45,8 +45,10 @@ def recover(file: Path) -> Recovered:
         writer, damaged = _rewrite(file, target)
         if writer is None:
             lost = "its metadata or its problem are lost"
-            raise UserError(f"file={file}: too damaged, {lost} ({'; '.join(damaged)})")
+            raise UserError("; ".join([f"file={file}: too damaged, {lost}", *damaged]))
         try:
+            if not writer.episodes:
+                raise UserError("; ".join([f"file={file}: holds no whole episode", *damaged]))
             return Recovered(writer.finish(), writer.episodes, tuple(damaged))
         finally:
             writer.abandon()  # a full disk leaves it open
