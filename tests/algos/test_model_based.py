@@ -144,7 +144,7 @@ def test_it_keeps_to_a_budget_also_while_learning(budget: int) -> None:
 @pytest.mark.slow
 def test_plans_on_paths_keep_to_a_budget() -> None:
     world = headings(memory="displacement").but(budget=1)
-    learner, rows = learn(world, 3, "algo.prior=1", envs=16)
+    learner, rows = learn(world, 3, "kernel=heading", "algo.prior=1", envs=16)
     assert int(learner.actor.dense().sum(-1).max()) == 1
     assert rows[-1]["sensors_per_frame"] < 1.0
 
