@@ -24,17 +24,16 @@ TRAIN = (
     "train algo=ppo grid.size=3 collector.total_frames=256 collector.frames_per_batch=256 "
     "collector.envs=32 algo.minibatches=1 optimal.enabled=false collector="
 )
-RAY = [installed("ray"), pytest.mark.slow]
 LINES = [
     f"{SOLVE}basic",
     pytest.param(f"{SOLVE}joblib", marks=[installed("joblib"), pytest.mark.slow]),
     pytest.param(f"{SOLVE}submitit_local", marks=[installed("submitit"), pytest.mark.slow]),
     BLOCKS,
     pytest.param(f"{TRAIN}multi_sync", marks=pytest.mark.slow),
-    pytest.param(f"{TRAIN}multi_async", marks=pytest.mark.slow),
-    pytest.param(f"{SOLVE}ray", marks=RAY),
-    pytest.param(f"{BLOCKS} partition.cluster=local", marks=RAY),
-    pytest.param(f"{TRAIN}ray", marks=RAY),
+    pytest.param(f"{TRAIN}multi_async", marks=pytest.mark.long),
+    pytest.param(f"{SOLVE}ray", marks=[installed("ray"), pytest.mark.slow]),
+    pytest.param(f"{BLOCKS} partition.cluster=local", marks=[installed("ray"), pytest.mark.long]),
+    pytest.param(f"{TRAIN}ray", marks=[installed("ray"), pytest.mark.long]),
 ]
 
 

@@ -82,7 +82,7 @@ def hang_up(run: subprocess.Popen[str], terminal: int) -> str:
 LINES = [
     f"train {TRAIN} hydra.run.dir=a",
     f"train {TRAIN} collector=multi_sync collector.workers=2 hydra.run.dir=a",
-    f"train -m {TRAIN} seed=0,1 hydra.sweep.dir=a",
+    pytest.param(f"train -m {TRAIN} seed=0,1 hydra.sweep.dir=a", marks=pytest.mark.long),
     f"train -m {TRAIN} seed=0,1 hydra.sweep.dir=a hydra/launcher=joblib",
 ]
 

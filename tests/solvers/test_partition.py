@@ -310,9 +310,9 @@ class Saves:
             raise Preempted(signals.received)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("cluster", "kind"), [(None, signal.SIGUSR1), (None, signal.SIGTERM), ("local", signal.SIGTERM)]
+    ("cluster", "kind"),
+    later([(None, signal.SIGTERM), (None, signal.SIGUSR1), ("local", signal.SIGTERM)]),
 )
 def test_a_signal_ends_all_workers_and_none_begins_another_job(
     tmp_path: Path, cluster: str | None, kind: signal.Signals

@@ -247,15 +247,16 @@ def test_the_result_does_not_depend_on_the_workers(
     assert policies(tmp_path) == policies(uncut.folder)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algo", "words"),
-    [
-        ("hindsight", {"updates": 20, "hidden": 8}),
-        ("a2c", {"envs": 50}),
-        ("ppo", {"minibatches": 5}),
-        ("dqn_per_sensor", {"updates": 20, "hidden": 8}),
-    ],
+    later(
+        [
+            ("hindsight", {"updates": 20, "hidden": 8}),
+            ("a2c", {"envs": 50}),
+            ("ppo", {"minibatches": 5}),
+            ("dqn_per_sensor", {"updates": 20, "hidden": 8}),
+        ]
+    ),
 )
 def test_every_learner_learns_by_blocks(algo: str, words: dict[str, Any]) -> None:
     options = {name: value for name, value in SMALL.items() if "plan" not in name} | words

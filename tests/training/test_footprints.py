@@ -77,16 +77,17 @@ LEARNS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algo", "t_max"),
-    [
-        ("hindsight", 0),
-        ("hindsight", 2),
-        ("a2c_per_sensor", 2),
-        ("ppo_per_sensor", 0),
-        ("dqn_per_sensor", 2),
-    ],
+    later(
+        [
+            ("hindsight", 2),
+            ("hindsight", 0),
+            ("a2c_per_sensor", 2),
+            ("ppo_per_sensor", 0),
+            ("dqn_per_sensor", 2),
+        ]
+    ),
 )
 def test_what_sensors_gain_beside_the_others_leads_to_the_optimum(algo: str, t_max: int) -> None:
     world = World.of(_world(), small_world(exit_probability=0.02).kernel, t_max=t_max)
@@ -107,15 +108,16 @@ def test_sets_that_cool_down_do_not_end_where_no_single_sensor_gains() -> None:
     assert (best.upper - run.evaluation.aihtr) / run.evaluation.expected_length < 0.002
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algo", "options"),
-    [
-        ("model_based", {"sensing": "all"}),
-        ("model_based", {"sensing": "chosen"}),
-        ("hindsight", {}),
-        ("a2c_per_sensor", {}),
-    ],
+    later(
+        [
+            ("hindsight", {}),
+            ("model_based", {"sensing": "all"}),
+            ("model_based", {"sensing": "chosen"}),
+            ("a2c_per_sensor", {}),
+        ]
+    ),
 )
 def test_moves_to_cells_that_none_covers_are_inferred(algo: str, options: dict[str, str]) -> None:
     """Two cells are covered by no sensor: moves to them are told by what is missed, and by the safe action."""
