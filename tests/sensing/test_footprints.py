@@ -11,6 +11,7 @@ import pytest
 import torch
 from scipy import sparse
 
+import trackmdp as tm
 from tests.helpers import advanced, small_world
 from trackmdp import machine
 from trackmdp.app.cli import main
@@ -209,6 +210,40 @@ def test_footprints_with_other_features_by_hand(given: dict[str, object], earned
     on[world.keys.cell(np.arange(world.num_keys)) == 1, 0, 1 if world.available[1] else 0] = True
     truncated = world.but(max_steps=1)
     assert evaluate(truncated, Policy.from_dense(world, on)).value[1] == pytest.approx(0.9 * earned)
+
+
+def test_a_table_of_footprints_is_an_argument(tmp_path: Path) -> None:
+    """Of `make_world` and `load_tracks`, in memory or in a file, in place of the cells' own sensors."""
+    wide, file = _wide(), tmp_path / "a.npz"
+    assert wide.coverage is not None
+    sparse.save_npz(file, wide.coverage.matrix)
+    (tmp_path / "t.csv").write_text("track,cell\n" + "".join(f"{i},4\n{i},5\n" for i in range(9)))
+    given = {"size": 3, "cost": [0.1, 0.2, 0.3, 0.4], "detection": 0.9, "safe_cost": 2.0}
+    for table in (wide.coverage.matrix, wide.coverage.matrix.toarray(), str(file)):
+        for made in (
+            tm.make_world("random_walk", coverage=table, **given),
+            tm.load_tracks(tmp_path / "t.csv", min_length=2, coverage=table, **given),
+            tm.make_world("drift", coverage=table, targets=2, **given).single,
+        ):
+            assert made.footprints == wide.footprints
+            assert (made.cost == wide.cost).all()
+            assert (made.detection == 0.9).all()
+            assert made.safe_cost == 2.0
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"coverage": np.ones((2, 8))}, "coverage: a table of 2 x 8, expected a row per sensor, 9"),
+        ({"coverage": np.ones((2, 9)), "cost": [0.1]}, "cost.sensor: 1 values, expected one"),
+        ({"coverage": "none.npz"}, "none.npz: no such file"),
+        ({"sensor": "footprint"}, "sensor: unknown argument, expected coverage, detection"),
+    ],
+)
+def test_footprints_that_do_not_fit_are_named(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError) as caught:
+        tm.make_world("random_walk", size=3, **given)
+    assert message in str(caught.value)
 
 
 def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

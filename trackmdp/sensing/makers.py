@@ -73,14 +73,19 @@ def footprint(
     path: str | None,
     p_d: float | list[float] | str,
     p_s: float | list[float] | str,
+    table: Any = None,
 ) -> dict[str, Any]:
-    """Discs of `radius` around the places of a lattice, or the footprints in a file; p_d and p_s as of `miss`.
+    """Discs of `radius` around the places of a lattice, the footprints in a file, or a `table` in place of the file.
+
+    p_d and p_s are those of `miss`.
 
     Raises:
         UserError: a file is missing or malformed, or does not fit this grid.
     """
     rows, columns = grid_size(size)
     missing = miss(size, p_d=p_d, p_s=p_s)
+    if table is not None:
+        return missing | {"coverage": Coverage.of(table, rows * columns)}
     if path is not None:
         table = read_matrix("sensor.path", path, name="coverage")
         try:

@@ -23,12 +23,13 @@ _KERNEL_BYTES = 500
 580, drift 940."""
 
 
-def make_problem(cfg: WorldConfig, *, frame: Any = None) -> Problem:
+def make_problem(cfg: WorldConfig, *, frame: Any = None, coverage: Any = None) -> Problem:
     """The world a config describes, or its recorded tracks.
 
     Args:
         cfg: the config.
         frame: positions as a DataFrame of pandas, in place of the file of `kernel=tracks`.
+        coverage: a table of footprints, in place of the file of `sensor=footprint`.
 
     Raises:
         UserError: the grid does not fit into memory, a file is missing or malformed, or the kernel or a track breaks a
@@ -37,12 +38,13 @@ def make_problem(cfg: WorldConfig, *, frame: Any = None) -> Problem:
     bytes_each = _KERNEL_BYTES if cfg.kernel.is_motion else TASK_BYTES
     check_fits("grid.size", cfg.grid.size, bytes_each)
     if cfg.kernel.is_motion:
-        return build_world(cfg)
-    return make(cfg.kernel, cfg.grid.size, where=cfg.grid.place, frame=frame, **of_task(cfg))
+        return build_world(cfg, coverage)
+    task = of_task(cfg, coverage)
+    return make(cfg.kernel, cfg.grid.size, where=cfg.grid.place, frame=frame, **task)
 
 
-def build_world(cfg: WorldConfig) -> World:
-    """The world a config describes.
+def build_world(cfg: WorldConfig, coverage: Any = None) -> World:
+    """The world a config describes; `coverage` as in `make_problem`.
 
     Raises:
         UserError: a file is missing or malformed, or the kernel breaks a rule (`motion/kernel_checks.py`).
@@ -52,7 +54,7 @@ def build_world(cfg: WorldConfig) -> World:
     made = maker(cfg.kernel)(cfg.grid.size, **own)
     if cfg.kernel.hides:
         made, modes["modes"] = made
-    task = of_task(cfg)
+    task = of_task(cfg, coverage)
     try:
         return World(made, cfg.grid.sides, **task, **modes)
     except UserError as error:  # with the option at fault
@@ -104,14 +106,15 @@ def recorded(
     )
 
 
-def of_task(cfg: WorldConfig) -> dict[str, Any]:
-    """Costs and limits of a world config, as arguments of `Task`."""
-    sensors: dict[str, Any] = make(cfg.sensor, cfg.grid.size)
+def of_task(cfg: WorldConfig, coverage: Any = None) -> dict[str, Any]:
+    """Costs and limits of a world config, as arguments of `Task`; `coverage` as in `make_problem`."""
+    given = {} if coverage is None else {"table": coverage}
+    sensors: dict[str, Any] = make(cfg.sensor, cfg.grid.size, **given)
     count = {}
-    if (coverage := Coverage.of(sensors.get("coverage"), cfg.grid.num_cells)) is not None:
-        sensors["coverage"] = coverage
+    if (footprints := Coverage.of(sensors.get("coverage"), cfg.grid.num_cells)) is not None:
+        sensors["coverage"] = footprints
         if "sensors" in signature(maker(cfg.cost)).parameters:  # prices per sensor, not per cell
-            count = {"sensors": coverage.num_sensors}
+            count = {"sensors": footprints.num_sensors}
     costs: dict[str, Any] = make(cfg.cost, cfg.grid.size, **count)
     limits = {"t_max": cfg.grid.t_max, "max_steps": cfg.grid.max_steps, "window": cfg.grid.window}
     # Recorded tracks come with their place.

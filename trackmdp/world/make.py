@@ -43,7 +43,7 @@ _OF_MISSES = {"detection": "sensor.p_d", "safe_detection": "sensor.p_s"}
 _OF_SENSORS = {
     "p_d": "detection",
     "p_s": "safe_detection",
-    "sensor": "detection and safe_detection",
+    "sensor": "coverage, detection and safe_detection",
 }
 """Names of the command line -> arguments of `make_world` and `load_tracks`."""
 
@@ -71,6 +71,7 @@ def make_world(
     budget: int | None = default("cost.budget"),
     detection: npt.ArrayLike | str = 1.0,
     safe_detection: npt.ArrayLike | str = 1.0,
+    coverage: Any = None,
     memory: str = default("task.memory"),
     clip: int = default("task.clip"),
     cell: float | None = default("grid.cell"),
@@ -89,7 +90,8 @@ def make_world(
             ``heading``, ``regimes``, ``constant_velocity`` or ``coordinated_turn``.
         size: N of an N x N grid, or (rows, columns).
         t_max: T_max; the controller chooses freely at n = 0 ... t_max.
-        cost: c, the price of one sensor for one step; one number, one per cell (nan: no sensor there), or a file.
+        cost: c, the price of one sensor for one step; one number, one per cell, or per sensor of `coverage` (nan: no
+            sensor there), or a file.
         safe_cost: D; None: the sum of all sensors' prices.
         reward: r, earned by a detection.
         max_steps: episodes are truncated after so many steps; None: never.
@@ -97,6 +99,9 @@ def make_world(
         budget: B; at most so many sensors on in a step. None: any number.
         detection: p_d, how likely a sensor that is on reports the target in its cell; as `cost`, in (0, 1].
         safe_detection: p_s, the same of the safe action, which is repeated until it locates; as `detection`.
+        coverage: the cells that each of S sensors covers: a table or sparse matrix `[S, M]` of 0 and 1, or of
+            probabilities that a sensor reports a target there, which are multiplied by p_d; or a file of one. None: one
+            sensor in each cell.
         memory: the policy's key at a detection, as in `load_tracks`; the cell, unless targets have a mode.
         clip: rows and columns up to which displacements are distinguished.
         cell: side of a cell, in metres or units of x and y; with `origin` it gives the grid a place (`World.place`).
@@ -129,7 +134,8 @@ def make_world(
         )
     words = given({"kernel": kernel}) | _words(arguments)
     targets = whole_number("targets", targets, 1, MOST_TARGETS)
-    world = modelled(make_problem(_config(words, targets)), f"kernel={kernel}")
+    made = make_problem(_config(words, targets), coverage=_in_memory(coverage))
+    world = modelled(made, f"kernel={kernel}")
     return world if targets == 1 else Group([world] * targets)
 
 
@@ -161,9 +167,9 @@ def load_tracks(
         targets: K; above 1 the result is a `Group`, of which so many tracks are followed at once: those whose times
             overlap, or where the recording has no times any.
         **options: of `make_world` all but the kernel's own: `t_max`, `cost`, `safe_cost`, `reward`, `max_steps`, at
-            which tracks are cut, `window`, `budget`, `detection`, `safe_detection`, `clip`, `memory` (``cell``,
-            ``displacement``, ``displacement_gap`` or ``two_displacements``), and `cell`, `origin` and `crs`: of
-            positions the side of a cell is needed, the others follow from them. Those of ``kernel=tracks``
+            which tracks are cut, `window`, `budget`, `detection`, `safe_detection`, `coverage`, `clip`, `memory`
+            (``cell``, ``displacement``, ``displacement_gap`` or ``two_displacements``), and `cell`, `origin` and `crs`:
+            of positions the side of a cell is needed, the others follow from them. Those of ``kernel=tracks``
             (``trackmdp train kernel=tracks --help``): `format`, `step`, `columns` (a dict, or a list as there),
             `max_gap`, `ends`, `starts`, `held_out`, `validation`, `seed`, `min_length`, `markov`.
 
@@ -184,7 +190,8 @@ def load_tracks(
         options["columns"] = [f"{ours}:{theirs}" for ours, theirs in named.items()]
     words = {"kernel": "tracks", "kernel.path": source} | _words({"size": size, **options})
     frame = path if in_memory else None
-    made = cast(Recorded, make_problem(_config(words, targets), frame=frame))
+    table = _in_memory(options.get("coverage"))
+    made = cast(Recorded, make_problem(_config(words, targets), frame=frame, coverage=table))
     return made if targets == 1 else Group.of_tracks(made, targets)
 
 
@@ -210,8 +217,14 @@ def _words(arguments: dict[str, Any]) -> dict[str, Any]:
     of_task = {
         known[name]: _flat(name, arguments.pop(name), size) for name in known if name in arguments
     }
+    if (coverage := arguments.pop("coverage", None)) is not None:
+        # A table has no file; named one, the config leaves the number of sensors, and of prices, to the table.
+        file = coverage if _in_memory(coverage) is None else "coverage.npz"
+        of_task |= {"sensor": "footprint", "sensor.path": file} | chances
     # The default sensors have no option for a probability of 1.
-    if any(isinstance(p, str | Path) or not np.all(np.asarray(p) == 1.0) for p in chances.values()):
+    elif any(
+        isinstance(p, str | Path) or not np.all(np.asarray(p) == 1.0) for p in chances.values()
+    ):
         of_task |= {"sensor": "miss"} | chances
     of_kernels = {name for schema in GROUPS["kernel"].values() for name in options(schema)}
     for name in arguments.keys() - of_kernels:
@@ -220,6 +233,11 @@ def _words(arguments: dict[str, Any]) -> dict[str, Any]:
         if close := difflib.get_close_matches(name, OF_TASK, n=1):
             raise UserError(f"{name}: unknown argument, did you mean {close[0]}?")
     return given(of_task | {f"kernel.{name}": value for name, value in arguments.items()})
+
+
+def _in_memory(coverage: Any) -> Any:
+    """The footprints, unless they are in a file."""
+    return None if isinstance(coverage, str | Path) else coverage
 
 
 def _flat(name: str, value: Any, size: Size) -> Any:
