@@ -30,10 +30,12 @@ _HOMES = {
     "Policy": "trackmdp.policies.policy",
     "Recorded": "trackmdp.recordings.tracks",
     "Run": "trackmdp.training.run",
+    "RunError": "trackmdp.errors",
     "Solution": "trackmdp.solvers.solution",
     "TrackEnv": "trackmdp.environment.env",
     "Tracker": "trackmdp.policies.tracker",
     "Tradeoff": "trackmdp.solvers.tradeoff",
+    "UserError": "trackmdp.errors",
     "World": "trackmdp.world.model",
     "compare": "trackmdp.training.compare",
     "evaluate": "trackmdp.solvers.evaluate",
@@ -55,6 +57,8 @@ if TYPE_CHECKING:  # the same once more, for type checkers and editors; `X as X`
     from trackmdp.environment.observation import ObservationVector as ObservationVector
     from trackmdp.episodes.batch import Episodes as Episodes
     from trackmdp.episodes.simulate import simulate as simulate
+    from trackmdp.errors import RunError as RunError
+    from trackmdp.errors import UserError as UserError
     from trackmdp.policies.export import export as export
     from trackmdp.policies.policy import Policy as Policy
     from trackmdp.policies.tracker import Tracker as Tracker

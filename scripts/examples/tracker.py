@@ -14,7 +14,6 @@ import tempfile
 from pathlib import Path
 
 import trackmdp as tm
-from trackmdp.errors import UserError
 from trackmdp.examples import example_file
 
 
@@ -24,19 +23,19 @@ def main(policy_file: Path, detections: Path) -> None:
     tracker, steps, located, sensing, safe = None, 0, 0, 0, 0
     rows = list(csv.DictReader(detections.read_text("utf-8-sig").splitlines()))
     if len(ids := sorted({row["id"] for row in rows if row.get("id")})) > 1:
-        raise UserError(f"{detections}: ids {', '.join(ids[:3])}, expected one target")
+        raise tm.UserError(f"{detections}: ids {', '.join(ids[:3])}, expected one target")
     for line, row in enumerate(rows or [{}], 2):
         axes = ("lat", "lon") if "lat" in row else ("x", "y")
         at = tuple(float(row[name]) for name in axes if row.get(name))
         if len(at) == 1 or not (at or tracker):  # the first line is a detection
-            raise UserError(f"{detections}: line {line}: {row}, expected {' and '.join(axes)}")
+            raise tm.UserError(f"{detections}: line {line}: {row}, expected {' and '.join(axes)}")
         if tracker is None:
             tracker = policy.tracker(at=at)
             continue
         on, due = tracker.sensors(), tracker.safe
         try:
             cell = policy.task.cell_of(*at) if at else None
-        except UserError:
+        except tm.UserError:
             tracker.exited()
             print(f"step {steps + 1}: left the grid")
             break
@@ -68,7 +67,7 @@ if __name__ == "__main__":
     if len(sys.argv) == 3:
         try:
             main(Path(sys.argv[1]), Path(sys.argv[2]))
-        except (UserError, OSError, ValueError) as error:
+        except (tm.UserError, OSError, ValueError) as error:
             sys.exit(f"tracker.py: {error}")
     else:
         with tempfile.TemporaryDirectory() as temporary:
