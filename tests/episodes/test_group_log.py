@@ -15,6 +15,7 @@ import trackmdp as tm
 from tests.episodes import groups
 from tests.episodes.logs import rewritten
 from tests.solvers.test_group import tiny
+from tests.solvers.test_group_modes import random_table, ring
 from trackmdp.app.cli import main
 from trackmdp.episodes import schema, writer
 from trackmdp.episodes.belief_filter import beliefs
@@ -216,6 +217,29 @@ def test_a_step_that_did_not_happen_is_found(name: str, tmp_path: Path) -> None:
     assert name in found.difference or name in ("target", "located")
 
 
+def test_the_mode_of_each_target_is_logged(tmp_path: Path) -> None:
+    """In the ring a move of one cell shows mode 0, of two mode 1; the second target keeps the mode of its start."""
+    group = Group([ring(0.3, detection=0.8), ring(0.0, detection=0.8)])
+    rule = make_rule(group, [random_table(world, 1) for world in group.kinds], "union")
+    episodes = played(30, rule=rule)
+    for each in episodes:
+        inside, before = each.target < 3, np.append(each.start[None], each.target[:-1], axis=0)
+        assert each.mode is not None
+        assert (each.mode == np.where(inside, (each.target - before) % 3 - 1, -1)).all()
+        assert (each.mode[inside[:, 1], 1] == each.start_mode[1]).all()
+    assert {each.start_mode[1] for each in episodes} == {0, 1}
+    file = write(tmp_path / "a.mcap", episodes, rule)
+    with EpisodeReader(file) as reader:
+        pairs = zip(episodes, reader.episodes(), strict=True)
+        assert not any(first_difference(mine, theirs) for mine, theirs in pairs)
+        assert (verify(reader).episodes, verify(reader).difference) == (30, None)
+    assert rewritten(file, tmp_path / "b.mcap").read_bytes() == file.read_bytes()
+    for name in ("mode", "start_mode"):
+        wrong = replace(episodes[0], **{name: 1 - getattr(episodes[0], name)})
+        with EpisodeReader(write(tmp_path / f"{name}.mcap", [wrong], rule)) as reader:
+            assert f"{name}: logged" in str(verify(reader).difference)
+
+
 def test_flipped_bits_are_reported(log: Path, tmp_path: Path) -> None:
     content, rng, flipped = log.read_bytes(), random.Random(0), tmp_path / "flipped.mcap"
     expected = played(20)
@@ -260,7 +284,7 @@ def test_a_log_with_a_problem_file_for_each_motion_is_of_another_format(
         older.setattr(writer, "problem_bytes", lambda group: problem_bytes(group.worlds[0]))
         file = write(tmp_path / "a.mcap", [])
     for read in (EpisodeReader, recover):
-        with pytest.raises(UserError, match=r"^file=.*a.mcap: format 4 \(.*\), expected format 6$"):
+        with pytest.raises(UserError, match=r"^file=.*a.mcap: format 4 \(.*\), expected format 7$"):
             read(file)
     assert [each.name for each in tmp_path.iterdir()] == ["a.mcap"]
 

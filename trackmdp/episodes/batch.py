@@ -127,6 +127,7 @@ class Episodes(Carded, Sequence[Episode]):
 
     def _episode(self, number: int) -> Episode:
         steps, start = self._steps(number), self.start[number]
+        mode = np.int64(0) if self.start_mode is None else self.start_mode[number]
         truncated = bool(self.truncated[steps][-1])
         made = Episode(
             number=number,
@@ -141,7 +142,7 @@ class Episodes(Carded, Sequence[Episode]):
             terminated=not truncated,
             truncated=truncated,
             mode=None if self.mode is None else self.mode[steps].astype(np.int64),
-            start_mode=0 if self.start_mode is None else int(self.start_mode[number]),
+            start_mode=mode if mode.ndim else int(mode),
         )
         return replace(made, action=self._action(made))
 

@@ -43,10 +43,10 @@ class Episode(Carded):
         belief: `[T, M]` probability of each cell after the move, given all that was observed before it; a row sums to
             the probability of no exit. Of K targets `[T · K, M]` sparse, row t · K + k of target k. None unless it was
             asked for.
-        mode: `[T]` the target's mode after the move, -1 once exited; None where targets have none.
+        mode: `[T]` the target's mode after the move, -1 once exited; `[T, K]`; None where targets have none.
         first_tick: place of its first step on the log's time line; None until it is logged.
         probability: `[T, M]` with which the policy sensed each cell. None unless it was asked for, and of K targets.
-        start_mode: the target's mode at the start; 0 where targets have none.
+        start_mode: the target's mode at the start; of K targets `[K]`; 0 where targets have none.
     """
 
     number: int
@@ -64,7 +64,7 @@ class Episode(Carded):
     mode: Indices | None = None
     first_tick: int | None = None
     probability: Any = None
-    start_mode: int = 0
+    start_mode: Any = 0
 
     def __len__(self) -> int:
         return len(self.target)
@@ -101,11 +101,14 @@ class Episode(Carded):
         if not self.several:
             yield self
             return
+        names = ("misses", "target", "located") + (() if self.mode is None else ("mode",))
+        modes = np.broadcast_to(self.start_mode, self.start.shape).tolist()
         for k, start in enumerate(self.start):
-            columns = {name: getattr(self, name)[:, k] for name in ("misses", "target", "located")}
+            columns = {name: getattr(self, name)[:, k] for name in names}
             belief = None if self.belief is None else self.belief[k :: len(self.start)].toarray()
             probability = self.action.astype(np.float32)
-            yield replace(self, start=int(start), belief=belief, probability=probability, **columns)
+            begun = {"start": int(start), "start_mode": modes[k]}
+            yield replace(self, belief=belief, probability=probability, **begun, **columns)
 
     def expected(self, t: int) -> AnyArray:
         """`[M]` how many targets were expected in each cell at step `t`; beliefs were asked for."""

@@ -105,7 +105,7 @@ class _Batch:
 
     def __init__(self, rule: Rule, paths: GroupPaths, seeds: Sequence[int]) -> None:
         self._rule, self._task, self._costs = rule, rule.task, Costs(rule.task)
-        self._shape = len(seeds), len(rule.group)
+        self._shape, self._modal = (len(seeds), len(rule.group)), rule.group.modes > 1
         # As with one target, moves and reports apart, so that two policies with one seed meet the same targets.
         draw, targets = paths.sampler.draw, self._shape[1]
         moves = Draws(seeds, lambda count, rng: draw(count * targets, rng).view(count, targets))
@@ -127,8 +127,13 @@ class _Batch:
         """Columns of `GroupEpisodes`, stepped until the last target has left, or until the last step allowed."""
         walks, cell = self._walks, self._rule.group.cell_of(self._walks.state)
         start = np.where(walks.inside, cell, self._task.num_cells).astype(np.int64)
+        begun = {"start": start} | ({"start_mode": self._modes()} if self._modal else {})
         columns, length = joined([self._taken(step) for step in self._steps(predicted=False)])
-        return columns | {"start": start, "length": length}
+        return columns | begun | {"length": length}
+
+    def _modes(self) -> IndexArray:
+        """`[E, K]`, the modes of all targets, -1 of those that are not in the grid."""
+        return np.where(self._walks.inside, self._walks.state % self._rule.group.modes, -1)
 
     def _taken(self, step: GroupStep) -> Columns:
         """The columns of a step."""
@@ -151,6 +156,8 @@ class _Batch:
             "truncated": some,
             "row": row,
         }
+        if self._modal:
+            columns["mode"] = self._modes()[row]
         return {name: narrow(column) for name, column in columns.items()}
 
     def beliefs(self) -> Iterator[sparse.csr_array]:

@@ -64,7 +64,8 @@ class Form:
 
     def row(self, episode: Any, first_tick: int) -> dict[str, Any]:
         """The `/episode` message."""
-        of_mode = {} if episode.mode is None else {"start_mode": episode.start_mode}
+        modal = episode.mode is not None
+        of_mode = {"start_mode": np.asarray(episode.start_mode).tolist()} if modal else {}
         return {
             **of_mode,
             "episode": episode.number,
@@ -160,15 +161,16 @@ class Form:
         self, row: dict[str, Any], said: list[dict[str, Any]], mine: dict[str, list[bytes]]
     ) -> Episode:
         """The episode of a row, the contents of its steps, and its messages by topic."""
-        task, targets, has_mode = self.task, len(self.problem.targets), modes_of(self.problem) > 1
-        misses, target, seen = (
-            np.array([each[name] for each in said], np.int64) for name in ("n", "target", "obs")
-        )
+        task, targets, modal = self.task, len(self.problem.targets), modes_of(self.problem) > 1
+        names = ("n", "target", "obs", "mode") if modal else ("n", "target", "obs")
+        parts = [np.array([each[name] for each in said], np.int64) for name in names]
         start, shape = np.array(row["start"], np.int64), (targets,) if targets else ()
-        if start.shape != shape or any(
-            each.shape != (len(said), *shape) for each in (misses, target, seen)
+        begun = np.array(row["start_mode"], np.int64) if modal else 0 * start
+        if {start.shape, begun.shape} != {shape} or any(
+            part.shape != (len(said), *shape) for part in parts
         ):
             raise ValueError(f"steps or starts of other than {targets or 1} targets")
+        misses, target, seen, *mode = parts
         action = np.zeros((len(said), task.total_sensors), bool)
         for t, each in enumerate(said):
             action[t, each["active"]] = True
@@ -176,7 +178,6 @@ class Form:
         reward = np.array([each["reward"] for each in said])
         if np.any(start > task.num_cells - (not targets)) or np.any(abs(reward) > _HUGE):
             raise ValueError("a start outside of the grid, or a reward out of range")
-        modes = np.array([each["mode"] for each in said], np.int64) if has_mode else None
         return Episode(
             number=row["episode"],
             seed=int(row["seed"]),
@@ -187,9 +188,9 @@ class Form:
             target=np.where(target < 0, task.num_cells, target),
             located=seen >= 0,
             reward=reward.astype(np.float32),
-            mode=modes,
+            mode=mode[0] if modal else None,
             first_tick=tick_of(int(row["start_time"])),
-            start_mode=row["start_mode"] if has_mode else 0,
+            start_mode=begun if targets else int(begun),
             **self._beliefs(mine),
         )
 

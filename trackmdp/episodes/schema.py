@@ -18,7 +18,7 @@ from trackmdp.errors import UserError
 from trackmdp.world.group import Subject
 from trackmdp.world.problem_file import PROBLEM, subject_in
 
-LOG_FORMAT = "6"
+LOG_FORMAT = "7"
 """Version of this layout; a reader refuses any other."""
 
 RUN, POLICY, END = "trackmdp.run", "trackmdp.policy", "trackmdp.end"
@@ -152,8 +152,8 @@ def policy_tables(number: int, facts: Mapping[str, str]) -> dict[str, str]:
 
 
 def modes_of(problem: Subject) -> int:
-    """H; 1 where targets have no modes, or there are several, whose modes are not logged."""
-    return 1 if problem.targets else getattr(problem.single, "modes", 1)
+    """H; 1 where targets have no modes."""
+    return getattr(problem, "modes", 1)
 
 
 def shape_of(problem: Subject) -> dict[str, str]:
