@@ -135,16 +135,20 @@ def test_a_model_of_stable_baselines_is_its_mode() -> None:
     class Model:
         """All that `evaluate` asks of one."""
 
-        observation_space = None
+        observation_space: Any = SimpleNamespace(spaces={"last_cell": torch.zeros(())})
 
         def predict(self, seen: dict[str, Any], deterministic: bool) -> tuple[Any, None]:
             assert deterministic
+            assert [*seen] == ["last_cell"]  # no other key has a place in its space
             near = np.abs(np.arange(9) - seen["last_cell"][:, None]) <= 1
             return near.astype(np.int8), None
 
     cells = torch.arange(9)
     same = tm.Policy.from_function(WORLD, lambda x, n, h: (cells - x[:, None]).abs() <= 1)
     assert tm.evaluate(WORLD, Model()).aihtr == tm.evaluate(WORLD, same).aihtr
+    Model.observation_space = SimpleNamespace(shape=(9,))
+    with pytest.raises(UserError, match="reads a SimpleNamespace, expected a Dict of last_cell"):
+        tm.evaluate(WORLD, Model())
 
 
 def test_a_model_of_stable_baselines_is_given_the_mask_and_refused_where_it_reads_more() -> None:

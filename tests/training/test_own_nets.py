@@ -57,6 +57,11 @@ def test_networks_of_ones_own_are_trained(algo: str) -> None:
     assert (found.sets != run.policy.sets).nnz == 0
 
 
+def lazy() -> ValueOperator:
+    """A critic that gets its sizes at the first call."""
+    return ValueOperator(MLP(out_features=1, num_cells=[16]), in_keys=["observation"])
+
+
 def test_one_of_them_may_be_the_algorithms() -> None:
     assert tm.train(WORLD, "a2c", actor=nets()["actor"], **FEW).evaluation.accuracy > 0
 
@@ -68,6 +73,7 @@ def test_one_of_them_may_be_the_algorithms() -> None:
         ("dqn", {"critic": nets()["critic"]}, "critic: algo=dqn makes its own"),
         ("a2c", {"actor": nn.Linear(3, 3)}, "actor: a Linear, expected a module that writes"),
         ("a2c", {"critic": nets()["actor"]}, "critic: a ProbabilisticActor, expected a module"),
+        ("a2c", {"critic": lazy()}, "critic: lazy layers, expected the sizes of all"),
         ("a2c", {"actor": nets()["actor"], "partition.block": 3}, "actor, critic: expected none"),
         (
             "ppo",

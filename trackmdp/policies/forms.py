@@ -110,17 +110,21 @@ def _predicted(task: Task | None, model: Any) -> Callable[..., Any]:
     """The mode of a model of Stable-Baselines3 as a function.
 
     Raises:
-        UserError: it reads more than a function is given, and the mask.
+        UserError: it reads more than a function is given, and the mask; or an array in place of a dict.
     """
     known = (*STATE_KEYS, "action_mask")
-    check_reads(getattr(model.observation_space, "spaces", known), known)
+    reads = getattr(model.observation_space, "spaces", None)
+    if reads is None:
+        found = type(model.observation_space).__name__
+        raise UserError(f"policy: the model reads a {found}, expected a Dict of {', '.join(known)}")
+    check_reads(reads, known)
     mask = None if task is None else ActionMask(task)
 
     def function(*state: Tensor) -> Any:
         seen = dict(zip(STATE_KEYS, state, strict=True))
         if mask is not None and mask.observed:
             seen["action_mask"] = mask(state[0])
-        return mode_of(model, seen)
+        return mode_of(model, {name: part for name, part in seen.items() if name in reads})
 
     return function
 

@@ -12,6 +12,7 @@ from tensordict.nn import (
     TensorDictModuleBase,
     TensorDictSequential,
 )
+from torch.nn.parameter import is_lazy
 
 from trackmdp.config import GROUPS, TrainConfig, options
 from trackmdp.config.compose import compose, default, given
@@ -143,6 +144,10 @@ def _nets(
         if wanted not in getattr(net, "out_keys", ()):
             raise UserError(
                 f"{name}: a {type(net).__name__}, expected a module that writes {wanted}"
+            )
+        if any(map(is_lazy, net.parameters())):
+            raise UserError(
+                f"{name}: lazy layers, expected the sizes of all, known after a first call"
             )
         if folder is not None:
             raise UserError(f"folder={folder}: expected None with {name}: its class is in no file")
