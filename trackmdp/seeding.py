@@ -68,3 +68,16 @@ def preserved_global_rng() -> Iterator[None]:
     devices = list(range(torch.cuda.device_count())) if torch.cuda.is_available() else []
     with torch.random.fork_rng(devices=devices):
         yield
+
+
+@contextmanager
+def single_precision() -> Iterator[None]:
+    """Make networks and rewards in float32 inside, whatever the user's default: the same seed gives the same bytes."""
+    import torch
+
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 import torch
 
-from tests.helpers import later
+import trackmdp as tm
+from tests.helpers import later, small_world
 from tests.training.runs import train
 from tests.training.test_state import forged
 from trackmdp.app.cli import main
@@ -68,3 +69,18 @@ def test_whole_rewards_in_a_buffer_are_refused(tmp_path: Path, capfd: Any) -> No
     words = ["collector.total_frames=4096", "checkpoint.keep=1"]
     assert main(["train", f"resume={tmp_path / 'run'}", *words]) == 2
     assert "next.reward: torch.int64, expected torch.float32" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("algo", ["a2c", "hindsight"])
+def test_the_users_own_default_type_changes_nothing(algo: str) -> None:
+    few = {"total_frames": 4096, "frames_per_batch": 2048, "envs": 64}
+    more = {"updates": 3, "batch_size": 64} if algo == "hindsight" else {}
+    world = small_world()
+    policy = tm.train(world, algo, **few, **more).policy
+    torch.set_default_dtype(torch.float64)
+    try:
+        other = tm.train(world, algo, **few, **more).policy
+        assert torch.get_default_dtype() == torch.float64
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert (policy.sets != other.sets).nnz == 0

@@ -20,7 +20,7 @@ from trackmdp.config.logs import require_packages
 from trackmdp.config.resume import run_folder
 from trackmdp.environment.observation import ObservationVector
 from trackmdp.errors import UserError, path_of
-from trackmdp.seeding import preserved_global_rng
+from trackmdp.seeding import preserved_global_rng, single_precision
 from trackmdp.training.blocks import make_trainer
 from trackmdp.training.callbacks import Callback
 from trackmdp.training.display import make_console
@@ -90,7 +90,10 @@ def train(
     config, subject = _config(problem, typed, place)
     if place is not None:
         _prepare(config, place)
-    with locked_run(place, "folder") if place else nullcontext(), preserved_global_rng():
+    # Networks of one's own are of the precision that they were made in.
+    precision = nullcontext() if nets else single_precision()
+    lock = locked_run(place, "folder") if place else nullcontext()
+    with lock, preserved_global_rng(), precision:
         console = make_console(quiet=not progress)
         return complete(
             make_trainer(subject, config, place, console, callbacks=callbacks, nets=nets)
