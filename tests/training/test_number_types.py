@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -71,16 +74,34 @@ def test_whole_rewards_in_a_buffer_are_refused(tmp_path: Path, capfd: Any) -> No
     assert "next.reward: torch.int64, expected torch.float32" in capfd.readouterr().err
 
 
+FEW = {"total_frames": 4096, "frames_per_batch": 2048, "envs": 64}
+
+
+@pytest.fixture
+def double() -> Iterator[Callable[[], None]]:
+    """Makes float64 torch's default type until the end of the test."""
+    yield partial(torch.set_default_dtype, torch.float64)
+    torch.set_default_dtype(torch.float32)
+
+
 @pytest.mark.parametrize("algo", ["a2c", "hindsight"])
-def test_the_users_own_default_type_changes_nothing(algo: str) -> None:
-    few = {"total_frames": 4096, "frames_per_batch": 2048, "envs": 64}
+def test_the_users_own_default_type_changes_nothing(algo: str, double: Callable[[], None]) -> None:
     more = {"updates": 3, "batch_size": 64} if algo == "hindsight" else {}
     world = small_world()
-    policy = tm.train(world, algo, **few, **more).policy
-    torch.set_default_dtype(torch.float64)
-    try:
-        other = tm.train(world, algo, **few, **more).policy
-        assert torch.get_default_dtype() == torch.float64
-    finally:
-        torch.set_default_dtype(torch.float32)
+    policy = tm.train(world, algo, **FEW, **more).policy
+    double()
+    other = tm.train(world, algo, **FEW, **more).policy
     assert (policy.sets != other.sets).nnz == 0
+    assert torch.get_default_dtype() == torch.float64
+
+
+def test_a_run_is_read_under_any_default_type(tmp_path: Path, double: Callable[[], None]) -> None:
+    group, exact = (
+        tm.Group([small_world()] * 2),
+        {"optimal.enabled": False, "evaluation.width": 0.1},
+    )
+    tm.train(group, "a2c", folder=tmp_path / "run", **FEW, **exact)
+    found = tm.evaluate(group, tm.load_run(tmp_path / "run"), width=0.1)
+    double()
+    again = tm.evaluate(group, tm.load_run(tmp_path / "run"), width=0.1)
+    assert np.array_equal(found.totals, again.totals)

@@ -18,7 +18,7 @@ from trackmdp.config import TrainConfig
 from trackmdp.config.roots import OptimalBoundConfig
 from trackmdp.policies.policy import Policy
 from trackmdp.recordings.tracks import Recorded
-from trackmdp.seeding import derive, preserved_global_rng
+from trackmdp.seeding import derive, preserved_global_rng, single_precision
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation, regret_per_step
@@ -91,7 +91,7 @@ def joint_policy(
         RuntimeError, TypeError: the weights are of other networks, or no real numbers.
     """
     device = torch.device("cpu")
-    with preserved_global_rng():
+    with preserved_global_rng(), single_precision():
         algorithm = make_algorithm(cfg, group.task, device, targets=group.targets)
     # torch would take the real parts of complex weights, and warn.
     weights = {

@@ -27,6 +27,7 @@ from trackmdp.machine import torch_threads
 from trackmdp.notebook.card import NONE, Card, Carded, decimal, grid_words
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import load_policy
+from trackmdp.seeding import single_precision
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import group_rule
 from trackmdp.solvers.evaluation import Evaluation, figures
@@ -303,6 +304,7 @@ def references(evaluator: Evaluator, solution: Solution | None) -> dict[str, Any
     return {name: figures(each) for name, each in found.items()}
 
 
+@single_precision()
 def trained(
     run: str, device: torch.device, *, best: bool = False, targets: int | None = None
 ) -> tuple[Subject, Any, str]:
