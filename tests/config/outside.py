@@ -24,9 +24,20 @@ FILES = {
             m = rows * columns
             here = sparse.eye_array(m).tocsr()
             return (here * stay + here[::-1] * (1 - stay)) * (1 - exit_probability)
+
+        def hidden(size, **options):
+            jumps = jump(size, **options)
+            return sparse.kron(jumps, sparse.eye_array(2)).tocsr(), 2
     """,
     "outside/jump_config.py": """
-        from trackmdp.config import KernelConfig, choice, option
+        from trackmdp.config import HiddenKernelConfig, KernelConfig, choice, option
+
+        @choice("kernel", "hidden_jump", makes="outside.jump:hidden")
+        class HiddenJumpConfig(HiddenKernelConfig):
+            '''Has one of two modes.'''
+
+            stay: float = option("probability of staying", ge=0, le=1)
+            exit_probability: float = option("probability of leaving the grid", ge=0, lt=1)
 
         @choice("kernel", "jump", makes="outside.jump:jump")
         class JumpConfig(KernelConfig):
@@ -40,6 +51,13 @@ FILES = {
 
         stay: 0.5
         exit_probability: 0.1
+    """,
+    "outside/conf/kernel/hidden_jump.yaml": """
+        defaults: [base_hidden_jump]
+
+        stay: 0.5
+        exit_probability: 0.1
+        reveals: false
     """,
     # An algorithm.
     "outside/lazy.py": """

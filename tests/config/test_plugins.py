@@ -64,7 +64,7 @@ def test_three_files_each() -> None:
             f"outside/{name}_config.py",
             f"outside/conf/{group}/{name}.yaml",
         } <= set(FILES)
-    assert len(FILES) == 5 * 3 + 4  # and one of the memory
+    assert len(FILES) == 5 * 3 + 5  # and one of the memory, and values of a second kernel
 
 
 def test_help_lists_it(site: Path, tmp_path: Path) -> None:
@@ -87,6 +87,7 @@ USED = """
 import trackmdp as tm
 from tests import helpers
 assert tm.make_world("jump", size=3, stay=0.25).kernel[0, 0] == 0.25 * 0.9
+assert tm.make_world("hidden_jump", size=3).modes == 2
 assert "jump" in helpers.KERNELS and "lazy" in helpers.ALGORITHMS
 """
 
@@ -142,7 +143,7 @@ def test_its_options_are_checked(site: Path, tmp_path: Path) -> None:
         f"{TRAIN} algo.naps=10": "algo.naps=10: expected an integer from 0 to 9 (naps)",
         f"{TRAIN} algo.naps=5 algo.envs=4": "algo.naps=5: expected at most collector.envs=4",
         f"{TRAIN} algo.bed=1000000000000000": "algo.bed=1000000000000000: needs about",
-        "train kernel=jmup": f"kernel=jmup: expected one of {kernels}, jump",
+        "train kernel=jmup": f"kernel=jmup: expected one of {kernels}, hidden_jump, jump",
     }
     for (status, _, error), message in zip(
         called(site, tmp_path, *refused), refused.values(), strict=True

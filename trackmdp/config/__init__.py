@@ -4,6 +4,7 @@ Here stand the names that commands and plugins use most; each schema is in a mod
 """
 
 from trackmdp.config.baselines import BaselineConfig, PlaybackConfig
+from trackmdp.config.hidden_kernels import HiddenKernelConfig
 from trackmdp.config.learning import AlgoConfig, CollectorConfig
 from trackmdp.config.logs import (
     CsvConfig,
