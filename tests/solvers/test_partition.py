@@ -10,6 +10,7 @@ import sys
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import nullcontext
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,45 @@ def test_a_rectangle_has_the_moves_of_the_whole_grid() -> None:
     cells = (np.arange(2, 6)[:, None] * 9 + np.arange(3, 8)).ravel()
     part = sub_world(world, (range(2, 6), range(3, 8)))
     assert np.array_equal(part.kernel.toarray(), world.kernel.toarray()[np.ix_(cells, cells)])
+
+
+def test_states_with_modes_are_cut_to_a_rectangle() -> None:
+    """Cell 5 of 4 x 4 has the states 40 to 47 of eight headings; in rows 1 and 2 of columns 1 to 3 it is cell 0."""
+    world = tm.make_world("heading", size=4, memory="displacement")
+    cells = np.array([5, 6, 7, 9, 10, 11])
+    states = (cells[:, None] * 8 + np.arange(8)).ravel()
+    part = sub_world(world, (range(1, 3), range(1, 4)))
+    assert (part.size, part.modes, part.memory) == ((2, 3), 8, "displacement")
+    assert np.array_equal(part.kernel.toarray(), world.kernel.toarray()[np.ix_(states, states)])
+    assert (reach(world), default_halo(world)) == (1, 3)
+    assert default_halo(world.but(memory="two_displacements")) == 6
+
+
+def test_blocks_lose_nothing_where_the_mode_is_revealed() -> None:
+    world = tm.make_world("heading", size=7, window=2, safe_cost=5.0, reveals=True)
+    whole, parts = tm.solve(world), tm.solve(world, block=4)
+    alone = tm.solve(world, block=4, sweeps=0)
+    assert whole.certified and parts.certified
+    for found in (parts, alone):
+        assert found.lower == pytest.approx(whole.lower, rel=1e-6)
+    assert alone.upper >= whole.lower - 1e-9
+
+
+def test_plans_of_keys_are_put_together_where_the_mode_is_hidden() -> None:
+    """On a line the target goes on with .8, or turns with .1; the last displacement shows where it goes next."""
+    kernel = np.zeros((16, 16))
+    for cell, mode, chance, after in product(range(8), range(2), (0.8, 0.1), range(2)):
+        to = cell + (1, -1)[after]
+        if 0 <= to < 8 and (chance == 0.8) == (mode == after):
+            kernel[2 * cell + mode, 2 * to + after] = chance
+    world = World(kernel, (1, 8), modes=2, cost=0.3, safe_cost=1.0, t_max=0, memory="displacement")
+    whole, parts = (tm.solve(world, **by) for by in ({}, {"block": 3}))
+    assert parts.table.task.num_keys == world.num_keys
+    assert parts.lower == pytest.approx(whole.lower, rel=1e-3)
+    assert parts.lower > 1.2 * tm.solve(world.but(memory="cell"), block=3).lower
+    assert parts.upper >= whole.lower
+    by_itself, apart = tm.solve(world, "qmdp"), tm.solve(world, "qmdp", block=3)
+    assert apart.lower == pytest.approx(by_itself.lower, rel=1e-9)
 
 
 def test_footprints_are_cut_to_a_rectangle() -> None:

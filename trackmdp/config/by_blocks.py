@@ -13,8 +13,8 @@ class PartitionConfig(NodeConfig):
 
     block: int | None = count_option("side of a block; null = the whole grid is one", unit="cells")
     halo: int | None = option(
-        "cells around its own that a block includes; null = R (T_max + 2), R the reach of a move, and with footprints "
-        "at least grid.window, which loses nothing",
+        "cells around its own that a block includes; null = R (T_max + 2), R the reach of a move, twice as many with "
+        "two_displacements, and with footprints at least grid.window, which loses nothing",
         unit="cells",
         ge=0,
     )
@@ -34,7 +34,7 @@ class PartitionConfig(NodeConfig):
         """A motion can be cut to a rectangle; by blocks, no log is written but the blocks' own."""
         if self.block is None:
             return
-        if not root.kernel.is_motion or root.kernel.hides:
+        if not root.kernel.is_motion:
             raise refuse(f"{key}.block", self.block, f"null with kernel={root.kernel.name}")
         if not root.learns:
             return

@@ -37,7 +37,7 @@ Rectangle: TypeAlias = tuple[range, range]
 """Rows and columns of the grid."""
 
 Pairs: TypeAlias = tuple[IndexArray, IndexArray]
-"""Located cells and sensors, a pair for each sensor that is on."""
+"""Keys and sensors, a pair for each sensor that is on."""
 _JOBS = 64
 """Jobs that the blocks of a grid are put into: a worker that dies loses one, and each costs a message."""
 
@@ -65,12 +65,16 @@ _Planned: TypeAlias = tuple[int, World, Block, IndexArray]
 
 def reach(world: World) -> int:
     """R, the most rows or columns that a move can lead away."""
-    return int(apart(world.columns, row_index(world.kernel), world.kernel.indices).max(initial=0))
+    cell, moves = world.motion.cell, world.kernel
+    return int(apart(world.columns, cell[row_index(moves)], cell[moves.indices]).max(initial=0))
 
 
 def default_halo(world: World) -> int:
-    """R (t_max + 2), how far away the target can be located next: t_max + 1 free choices and the safe action."""
-    return halo_of(world, world.t_max + 2)
+    """R (t_max + 2), how far away the target can be located next: t_max + 1 free choices and the safe action.
+
+    As often as a key remembers detections before the last one: a key that cannot occur in a block has no plan.
+    """
+    return halo_of(world, (world.t_max + 2) * max(world.order, 1))
 
 
 def halo_of(world: World, moves: int) -> int:
@@ -117,13 +121,14 @@ def sub_world(world: World, seen: Rectangle) -> World:
     """
     rows, columns = seen
     cells, sensors = cells_of(seen, world.columns), sensors_of(world, seen)
-    kernel = within(world.kernel[cells], world, seen)
+    kernel = within(world.kernel[numbered(cells, world.modes)], world, seen, world.modes)
     own = {name: getattr(world, name)[cells] for name in ("detection", "safe_detection")}
     own |= {"cost": world.cost[sensors]}
     if world.coverage is not None:
         own |= {"coverage": within(world.coverage.matrix[sensors], world, seen)}
     # Its corner is another one.
-    return World.of(world, kernel, size=(len(rows), len(columns)), place=None, **own)
+    own |= {"size": (len(rows), len(columns)), "modes": world.modes, "place": None}
+    return World.of(world, kernel, **own)
 
 
 def sets_within(
@@ -139,18 +144,23 @@ def sets_within(
     return found if chosen is None else ones_at(row[chosen], found.indices[chosen], found.shape)
 
 
-def within(matrix: sparse.csr_array, world: World, seen: Rectangle) -> sparse.csr_array:
-    """`[K, L]`, of a matrix `[K, M]` the columns of the L cells of a rectangle, numbered as in it."""
+def within(
+    matrix: sparse.csr_array, world: World, seen: Rectangle, each: int = 1
+) -> sparse.csr_array:
+    """`[K, L]`, of a matrix `[K, M]` the columns of the L cells of a rectangle, numbered as in it.
+
+    Where there are `each` columns for a cell, such as those of its modes, L and M are so many times larger.
+    """
     rows, columns = seen
+    every, mode = np.divmod(matrix.indices, each)
     # Not by matrix[:, cells], which takes M steps for each block. With 10 columns, cell 57 is (5, 7): in the rectangle
     # of rows 4 to 8 and columns 6 to 8 it is (1, 1), number 1 * 3 + 1 = 4.
-    row, column = np.divmod(matrix.indices, world.columns)
+    row, column = np.divmod(every, world.columns)
     row, column = row - rows.start, column - columns.start
     cell, inside = cell_at((len(rows), len(columns)), row, column)
-    place = (row_index(matrix)[inside], cell[inside])
-    return type(matrix)(
-        (matrix.data[inside], place), shape=(matrix.shape[0], len(rows) * len(columns))
-    )
+    place = (row_index(matrix)[inside], cell[inside] * each + mode[inside])
+    shape = (matrix.shape[0], len(rows) * len(columns) * each)
+    return type(matrix)((matrix.data[inside], place), shape=shape)
 
 
 def plan_by_blocks(
@@ -198,7 +208,7 @@ def narrow_halo(
 
 @dataclass(frozen=True)
 class _PlanJob:
-    """Plans some blocks: for each n the sensed (located cells, sensors) of the whole grid, of their own cells alone."""
+    """Plans some blocks: for each n the (keys, sensors) of the whole grid, of their own cells alone."""
 
     plan: Planner
     columns: int
@@ -212,11 +222,15 @@ class _PlanJob:
         if not table.deterministic:
             raise UserError("partition.block: expected a policy that does not draw")
         sets = table.written
-        # Row 7 of a table with two choices is cell 3 after one miss.
-        cell, n = np.divmod(row_index(sets), world.num_choices)
-        cells, kept = cells_of(block.seen, self.columns), block.mine[cell]
+        # Row 7 of a table with two choices is key 3 after one miss.
+        key, n = np.divmod(row_index(sets), world.num_choices)
+        classes = table.task.keys.num_classes
+        keys, kept = (
+            numbered(cells_of(block.seen, self.columns), classes),
+            block.mine[key // classes],
+        )
         on = (np.flatnonzero(kept & (n == each)) for each in range(world.num_choices))
-        return [(cells[cell[each]], sensors[sets.indices[each]]) for each in on]
+        return [(keys[key[each]], sensors[sets.indices[each]]) for each in on]
 
 
 def end_to_end(parts: Sequence[Sequence[Pairs]]) -> list[Pairs]:
@@ -228,6 +242,11 @@ def end_to_end(parts: Sequence[Sequence[Pairs]]) -> list[Pairs]:
         )
         for step in zip(*parts, strict=True)
     ]
+
+
+def numbered(cells: IndexArray, each: int) -> IndexArray:
+    """`[L · each]`, numbers of the states or keys of L cells, `each` of a cell: of cell 3 with two, 6 and 7."""
+    return (cells[:, None] * each + np.arange(each)).ravel()
 
 
 def cells_of(part: Rectangle, columns: int) -> IndexArray:

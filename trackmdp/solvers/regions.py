@@ -33,6 +33,7 @@ from trackmdp.solvers.partition import (
     cells_of,
     end_to_end,
     halo_of,
+    numbered,
     reach,
     sensing_blocks,
     sensors_of,
@@ -189,7 +190,7 @@ def _regions(world: World, policy: PolicyTable, value: Array, side: int) -> Made
     def region(number: int) -> _Region:
         block = parts[number]
         cells, here = cells_of(block.seen, world.columns), sub_world(world, block.seen)
-        states = (cells[:, None] * world.num_choices + np.arange(world.num_choices)).ravel()
+        states = numbered(cells, world.num_choices)
         rows = policy.sets if policy.alike else policy.sets[states]
         mine = PolicyTable(here, sets_within(rows, world, block.seen, here))
         sensors = sensors_of(world, block.seen)

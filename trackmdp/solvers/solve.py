@@ -107,9 +107,9 @@ def run_solver(
 
     From `start`, a known policy, those solvers begin that take one; the policy is then no worse.
     """
-    if not world.tells_all or (world.modes > 1 and choice.name != "optimal"):
-        return _modes(world, choice, start, on_progress)
-    if world.memory != "cell":  # the state is known at a detection: more of the past is of no use
+    blind = not world.tells_all or (world.modes > 1 and choice.name != "optimal")
+    # Where the state is known at a detection, more of the past is of no use.
+    if not blind and world.memory != "cell":
         world = world.but(memory="cell")
     started = time.monotonic()
     if partition is not None and partition.block is not None:
@@ -117,8 +117,10 @@ def run_solver(
         with crew(workers, partition.cluster) as run:
             start = by_blocks(world, choice, partition, run)
         found = bracketed(world, start, time.monotonic() - started)
-        if found.certified or not _closes(world, choice, partition):
+        if blind or found.certified or not _closes(world, choice, partition):
             return found
+    if blind:
+        return _modes(world, choice, start, on_progress)
     taken = signature(maker(choice)).parameters
     offered: dict[str, Any] = {"on_progress": on_progress}
     if start is not None:
@@ -135,7 +137,7 @@ def _closes(world: World, choice: BaselineConfig, partition: SweptPartitionConfi
     Not so with a halo of its own, which shows its loss, and where one search of all cells takes too much.
     """
     whole = partition.halo is None and partition.sweeps != 0
-    return choice.name == "optimal" and whole and world.num_cells <= DIRECT_CELLS
+    return choice.name == "optimal" and whole and world.num_states <= DIRECT_CELLS
 
 
 def solve_group(
@@ -172,15 +174,19 @@ def by_blocks(
     world: World, choice: BaselineConfig, partition: SweptPartitionConfig, run: Crew
 ) -> PolicyTable:
     """The policy that `run` plans block by block and, with ``solver=optimal``, settles over the whole grid."""
+    from trackmdp.solvers.hidden import averaged
+
     assert partition.block is not None
+    # How often each mode occurs is known of the whole grid.
+    world = world if choice.name == "optimal" else averaged(world)
     # Other solvers' plans stay as they are, so a narrow halo shows its loss, unless asked otherwise.
     sweeps = (
         (_SWEEPS if partition.halo is None else 0) if partition.sweeps is None else partition.sweeps
     )
     table = plan_by_blocks(world, partial(_planned, choice), partition.block, partition.halo, run)
-    return (
-        settled(world, table, partition.block, sweeps, run) if choice.name == "optimal" else table
-    )
+    # With modes the regions that settle would have to know them.
+    settles = choice.name == "optimal" and world.modes == 1
+    return settled(world, table, partition.block, sweeps, run) if settles else table
 
 
 def _planned(choice: BaselineConfig, number: int, world: World) -> PolicyTable:  # noqa: ARG001
