@@ -156,6 +156,8 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
             "hydra.callbacks: not read",
         ),
         ("train hydra.searchpath=[pkg://email]", "hydra.searchpath: expected --config-dir FOLDER"),
+        ("train --config-path mine", "--config-path: expected --config-dir FOLDER"),
+        ("train -cp mine", "--config-path: expected --config-dir FOLDER"),
         (
             "train -m seed=0,1 hydra/launcher=basic,joblib",
             "hydra/launcher=basic,joblib: expected one launcher",

@@ -206,6 +206,8 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     # Intermixed: Hydra users write flags between overrides, `train algo=ppo -m seed=0,1`.
     args = _parser().parse_intermixed_args(list(words))
     # It is offered by the parser all the same, so that the refusal can give the reason.
+    if args.config_path is not None:
+        raise UserError("--config-path: expected --config-dir FOLDER")
     if args.experimental_rerun is not None:
         raise UserError(
             "--experimental-rerun: not offered, it would unpickle a file; start from the run's config.yaml"
@@ -275,6 +277,7 @@ def _parser() -> argparse.ArgumentParser:
     flag("--config-name", "-cn", help="the primary config in place of the command's")
     flag("--config-dir", "-cd", action="append", default=[], help="a folder with further choices")
     flag("--experimental-rerun", help="not offered")
+    flag("--config-path", "-cp", help="not offered")
     one_of = parser.add_mutually_exclusive_group().add_argument
     one_of("--run", "-r", action="store_true", help="run once")
     every = "run once for every combination of option=a,b,c"
