@@ -116,6 +116,9 @@ def test_unknown_choices_are_refused_naming_the_known_ones(
         ("replay file=log.mcap layout=/dev/null", "layout=/dev/null: expected a file to write"),
         ("train cost=0.2", "cost=0.2: expected cost.sensor=0.2"),
         ("train sensor=0.9", "sensor=0.9: expected sensor=miss sensor.p_d=0.9"),
+        ("train cost=my/c.csv", "cost=my/c.csv: expected cost.sensor=my/c.csv"),
+        ("train sensor=c.npz", "sensor=c.npz: expected sensor=footprint sensor.path=c.npz"),
+        ("train kernel=k.npy", "kernel=k.npy: expected kernel=table (or tracks) kernel.path=k.npy"),
         (
             "train kernel.path=x.npy",
             "kernel.path: an option of another choice, expected kernel=table or kernel=tracks",

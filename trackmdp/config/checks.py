@@ -53,6 +53,13 @@ RENAMED: dict[str, str] = {
 _VALUES = {"cost": "cost.sensor", "sensor": "sensor=miss sensor.p_d"}
 """Group -> words that end in the option that is meant where the group is given a number."""
 
+_FILES = {
+    "cost": "cost.sensor",
+    "sensor": "sensor=footprint sensor.path",
+    "kernel": "kernel=table (or tracks) kernel.path",
+}
+"""The same where it is given a file."""
+
 
 def suggestion(name: str, known: Iterable[str], listed: Iterable[str] | None = None) -> str:
     """`, did you mean ...? (known: ...)` for a name that is none of the known ones; `listed`: name only these."""
@@ -118,8 +125,9 @@ def check_choice(group: str, name: Any) -> None:
         return
     if (former := f"{group}={name}") in RENAMED:
         raise UserError(f"{former}: renamed, expected {RENAMED[former]}")
-    if group in _VALUES and name is not None and is_number(str(name)):
-        raise UserError(f"{group}={name}: expected {_VALUES[group]}={name}")
+    meant = _VALUES if is_number(str(name)) else _FILES if Path(str(name)).suffix else {}
+    if group in meant:
+        raise UserError(f"{group}={name}: expected {meant[group]}={name}")
     none = ", or log=[] for none" if group == "log" and name is None else ""
     raise refuse(group, name, f"one of {', '.join(typed_choices(group))}{none}")
 
