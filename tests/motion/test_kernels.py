@@ -232,7 +232,10 @@ def test_an_argument_of_another_name_is_refused_with_the_right_one() -> None:
     [
         ({"p_d": 0.9}, "p_d: unknown argument, expected detection"),
         ({"p_s": 0.9}, "p_s: unknown argument, expected safe_detection"),
-        ({"sensor": "miss"}, "sensor: unknown argument, expected detection and safe_detection"),
+        (
+            {"sensor": "miss"},
+            "sensor: unknown argument, expected coverage, detection and safe_detection",
+        ),
     ],
 )
 def test_a_sensor_as_of_the_command_line_is_refused_with_the_arguments_for_it(
