@@ -265,6 +265,13 @@ def test_every_learner_learns_by_blocks(algo: str, words: dict[str, Any]) -> Non
     assert kept[0].mean() > evaluate(world(), tm.Policy.none(world())).aihtr
 
 
+def test_blocks_learn_plans_of_keys() -> None:
+    keyed = world(memory="displacement")
+    run = tm.train(keyed, **SMALL)
+    assert run.policy.task.num_keys == keyed.num_keys
+    assert run.evaluation.aihtr > tm.solve(keyed, "qmdp").lower
+
+
 @pytest.mark.parametrize("options", [{"reveals": True}, *later([{"memory": "displacement"}])])
 def test_blocks_learn_against_targets_with_modes(options: dict[str, Any], tmp_path: Path) -> None:
     moving = tm.make_world(

@@ -72,7 +72,7 @@ def reach(world: World) -> int:
 def default_halo(world: World) -> int:
     """R (t_max + 2), how far away the target can be located next: t_max + 1 free choices and the safe action.
 
-    As often as a key remembers detections before the last one: a key that cannot occur in a block has no plan.
+    So many times as a key remembers detections before the last one, since one that cannot occur in a block has no plan.
     """
     return halo_of(world, (world.t_max + 2) * max(world.order, 1))
 
@@ -225,10 +225,8 @@ class _PlanJob:
         # Row 7 of a table with two choices is key 3 after one miss.
         key, n = np.divmod(row_index(sets), world.num_choices)
         classes = table.task.keys.num_classes
-        keys, kept = (
-            numbered(cells_of(block.seen, self.columns), classes),
-            block.mine[key // classes],
-        )
+        kept = block.mine[key // classes]
+        keys = numbered(cells_of(block.seen, self.columns), classes)
         on = (np.flatnonzero(kept & (n == each)) for each in range(world.num_choices))
         return [(keys[key[each]], sensors[sets.indices[each]]) for each in on]
 
