@@ -244,6 +244,35 @@ def test_several_targets_in_a_browser(targets: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+@pytest.mark.parametrize("targets", [1, 2])
+def test_the_mode_of_each_target_is_shown_in_a_browser(targets: int, tmp_path: Path) -> None:
+    """By its number, and by an arrow from the middle of the cell, as long as the mode's mean step or more."""
+    world = tm.make_world("heading", size=3, exit_probability=0.2)
+    found = tm.simulate(world if targets == 1 else tm.Group([world] * targets), "none", 9)
+    number = next(k for k, each in enumerate(found) if len(each) >= 4)
+    episode = found[number]
+    assert episode.mode is not None
+    with Browser(tmp_path / "profile") as browser:
+        browser.view(390, 844, "light")
+        browser.open(found.page(tmp_path / "a.html", number))
+        for modes, cells in zip(episode.mode, episode.target, strict=True):
+            told = [(int(m), int(c)) for m, c in zip(*np.atleast_1d(modes, cells), strict=True)]
+            shown = browser.ask("document.getElementById('v-mode').innerText")
+            assert shown == " ".join("–" if mode < 0 else str(mode) for mode, _ in told)
+            arrows = browser.ask("headings.map((each) => each.getAttribute('d'))")
+            for (mode, cell), arrow in zip(told, arrows, strict=True):
+                assert (arrow == "") == (mode < 0)
+                if arrow:  # M from L to, and the head
+                    drawn = np.array(re.findall(r"[-\d.e]+", arrow)[:4], float).reshape(2, 2)
+                    assert drawn[0] == pytest.approx([cell % 3 + 0.5, cell // 3 + 0.5])
+                    step, drift = drawn[1, ::-1] - drawn[0, ::-1], world.drift[mode]
+                    assert step @ drift == pytest.approx(np.hypot(*step) * np.hypot(*drift))
+                    assert np.hypot(*step) >= np.hypot(*drift) - 1e-9
+            browser.press("ArrowRight")
+        assert browser.problems == []
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 def test_the_page_of_a_recorded_track_has_neither_belief_nor_bound(tmp_path: Path) -> None:
     setting = recorded_tracks(by_hand([0, 1, 2, 5], [4, 3, 0], [8, 7, 4, 1]))
     file = simulate(setting, "all_on", 2).page(tmp_path / "a.html", 1)

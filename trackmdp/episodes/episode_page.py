@@ -14,7 +14,8 @@ from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.target_colours import COLOURS
 from trackmdp.sensing.task import Task
 from trackmdp.solvers import bounds
-from trackmdp.world.group import Subject
+from trackmdp.world.group import Group, Subject
+from trackmdp.world.model import World
 
 MOST_STEPS = 2000
 """Steps on a page, or frames of a video; a longer episode is cut there, with a note on the page."""
@@ -63,44 +64,33 @@ def _about(problem: Subject, episode: Episode, seed: str) -> str:
 def _content(problem: Subject, episode: Episode) -> dict[str, Any]:
     """The data of the page: of one target all at once, of several a part for each under `targets`."""
     shown, task = slice(0, MOST_STEPS), problem.task
-    targets = [_of_target(single, task) for single in episode.singles()]
+    worlds = problem.worlds if isinstance(problem, Group) else [problem.model]
+    singles = zip(episode.singles(), worlds, strict=True)
+    targets = [_of_target(single, world, task) for single, world in singles]
     own = {"targets": targets, "colours": COLOURS} if problem.targets else targets[0]
-    return (
-        own
-        | _of_world(problem, episode)
-        | {
-            "rows": task.rows,
-            "columns": task.columns,
-            "wide": PAGE_WIDE,
-            "forced": episode.forced(task.t_max)[shown].astype(int).tolist(),
-            "reward": episode.reward[shown].tolist(),
-            "total": episode.returns[shown].tolist(),
-            "on": episode.action[shown].sum(axis=1).tolist(),
-            "sensed": [_runs(row) for row in task.covered(episode.action[shown])],
-            "frame": "sensor on" if task.coverage is None else "cell sensed",
-        }
-    )
+    return own | {
+        # Of the start cell; there is none without a motion model, or of several targets.
+        "bound": problem.model and float(bounds.clocked(problem.model)[episode.start]),
+        "rows": task.rows,
+        "columns": task.columns,
+        "wide": PAGE_WIDE,
+        "forced": episode.forced(task.t_max)[shown].astype(int).tolist(),
+        "reward": episode.reward[shown].tolist(),
+        "total": episode.returns[shown].tolist(),
+        "on": episode.action[shown].sum(axis=1).tolist(),
+        "sensed": [_runs(row) for row in task.covered(episode.action[shown])],
+        "frame": "sensor on" if task.coverage is None else "cell sensed",
+    }
 
 
-def _of_world(problem: Subject, episode: Episode) -> dict[str, Any]:
-    """The clocked bound of the start cell, None without a motion model or of several targets; modes where there are."""
-    world = problem.model
-    if world is None:
-        return {"bound": None}
-    found: dict[str, Any] = {"bound": float(bounds.clocked(world)[episode.start])}
-    if episode.mode is not None:
-        found |= {
-            "mode": episode.mode[:MOST_STEPS].tolist(),
-            "drift": world.drift.round(3).tolist(),
-        }
-    return found
-
-
-def _of_target(episode: Episode, task: Task) -> dict[str, Any]:
-    """Where a target was, and where it was expected."""
+def _of_target(episode: Episode, world: World | None, task: Task) -> dict[str, Any]:
+    """Where a target was, and where it was expected; its modes, and their mean steps, where it has some."""
     shown = slice(0, MOST_STEPS)
     target = np.where(episode.target == task.num_cells, -1, episode.target)
-    return {
+    modes: dict[str, Any] = {}
+    if world is not None and episode.mode is not None:
+        modes = {"mode": episode.mode[shown].tolist(), "drift": world.drift.round(3).tolist()}
+    return modes | {
         "start": -1 if episode.start == task.num_cells else int(episode.start),
         "target": target[shown].tolist(),
         "located": episode.located[shown].astype(int).tolist(),
