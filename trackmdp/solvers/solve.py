@@ -108,6 +108,8 @@ def run_solver(
     From `start`, a known policy, those solvers begin that take one; the policy is then no worse.
     """
     blind = not world.tells_all or (world.modes > 1 and choice.name != "optimal")
+    if blind and (partition is None or partition.block is None):
+        return _modes(world, choice, start, on_progress)
     # Where the state is known at a detection, more of the past is of no use.
     if not blind and world.memory != "cell":
         world = world.but(memory="cell")
@@ -119,8 +121,6 @@ def run_solver(
         found = bracketed(world, start, time.monotonic() - started)
         if blind or found.certified or not _closes(world, choice, partition):
             return found
-    if blind:
-        return _modes(world, choice, start, on_progress)
     taken = signature(maker(choice)).parameters
     offered: dict[str, Any] = {"on_progress": on_progress}
     if start is not None:
