@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import pytest
@@ -311,6 +312,28 @@ def test_what_a_broken_launcher_left_undone_is_launched_again(
     assert calls == [5, 4, 3]
     assert states(here / "all") == ["done", "done", "done", "failed", "failed"]
     assert table(here / "all")[4]["reason"] == "the launcher broke down: OSError: the pool is gone"
+
+
+@pytest.mark.slow
+def test_a_launcher_that_breaks_down_leaves_no_run_behind(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else it would go on without its sweep, which could not launch it again, and wait for it at its end."""
+    from trackmdp.app.sweep import launchers
+
+    found = []
+
+    def breaks(cfg: Any, jobs: Any) -> None:
+        found.append([run_of(job.folder).state for job in jobs])
+        if len(found) == 1:
+            Thread(target=launchers.run_job, args=(jobs[0],), daemon=True).start()
+            while not list(here.rglob("metrics.csv")):
+                pass
+            raise OSError("the pool is gone")
+
+    monkeypatch.setattr(launchers, "run_basic", breaks)
+    assert swept(*SLOW, "quiet=true") == 1
+    assert found == [["waiting"], ["cut"], ["cut"]]
 
 
 def test_runs_have_the_threads_they_ask_for(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
