@@ -254,7 +254,7 @@ def stop_signal(sweep: Path) -> int:
     """The signal by which the sweep was asked to stop; 0 for none."""
     try:
         # Empty while it is being written; 0 then, and the next look finds the number.
-        return int((sweep / STOP).read_text(encoding="ascii") or 0)
+        return int((sweep / STOP).read_bytes() or 0)
     except (OSError, ValueError):
         return 0
 

@@ -156,7 +156,8 @@ class _Stop(Signals):
         try:
             # A file, since runs may be on other machines, where no signal reaches them. `finally`: with a full disk
             # the signal has still to be noted here.
-            self._file.write_text(str(number), encoding="ascii")
+            # Bytes: in a signal handler the first look-up of a codec may fail, which imports a module.
+            self._file.write_bytes(b"%d" % number)
         finally:
             super()._note(number, frame)
 
