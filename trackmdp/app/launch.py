@@ -205,7 +205,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     """
     # Intermixed: Hydra users write flags between overrides, `train algo=ppo -m seed=0,1`.
     args = _parser().parse_intermixed_args(list(words))
-    # It is offered by the parser all the same, so that the refusal can give the reason.
+    # Both are offered by the parser all the same, so that the refusal can give the reason.
     if args.config_path is not None:
         raise UserError("--config-path: expected --config-dir FOLDER")
     if args.experimental_rerun is not None:

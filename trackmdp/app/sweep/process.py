@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -101,15 +101,6 @@ def stop_all() -> None:
     """Ask every run that this process waits for to save and stop, and wait until they have."""
     for process in tuple(_running):
         _stop(process)
-
-
-@contextlib.contextmanager
-def ending_runs() -> Iterator[None]:
-    """No run of this process is left behind: a launcher that broke down may still wait for some in its threads."""
-    try:
-        yield
-    finally:
-        stop_all()
 
 
 def context_for(command: str) -> Any:

@@ -14,7 +14,7 @@ from rich.console import Console
 from trackmdp.app.prepare import shown
 from trackmdp.app.sweep.launchers import threads_of
 from trackmdp.app.sweep.plan import Job, progress
-from trackmdp.app.sweep.process import STOP, Launch, ending_runs, fail
+from trackmdp.app.sweep.process import STOP, Launch, fail, stop_all
 from trackmdp.config import TrainConfig
 from trackmdp.config.options import is_number
 from trackmdp.config.resume import by_key, continued
@@ -122,7 +122,7 @@ def _run(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
         try:
             # Here and not in each launcher: the fork server, worker processes and their children all inherit the
             # environment.
-            with threads_of(jobs), ending_runs():
+            with threads_of(jobs):
                 launch(jobs)
         except Exception as error:
             # No such cluster, or a file that cannot be written: the next round would meet the same.
@@ -130,6 +130,8 @@ def _run(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
                 raise
             why = f"the launcher broke down: {type(error).__name__}: {reason(error)}"
             sys.stderr.write(f"{why}\n")
+        finally:
+            stop_all()  # a launcher that broke down may still wait for runs in its threads
         # Not "running": another process holds that folder, and is at it.
         jobs = [job for job in jobs if run_of(job.folder).state in ("cut", "waiting")]
     for job in jobs if not stop.received else ():
