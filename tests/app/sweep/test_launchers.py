@@ -321,14 +321,17 @@ def test_a_launcher_that_breaks_down_leaves_no_run_behind(
     """Else it would go on without its sweep, which could not launch it again, and wait for it at its end."""
     from trackmdp.app.sweep import launchers
 
-    found = []
+    found, threads = [], []
 
     def breaks(cfg: Any, jobs: Any) -> None:
+        for thread in threads:  # which sees that the run has ended, but not of itself
+            thread.join()
         found.append([run_of(job.folder).state for job in jobs])
-        if len(found) == 1:
-            Thread(target=launchers.run_job, args=(jobs[0],), daemon=True).start()
+        if not threads:
+            threads.append(Thread(target=launchers.run_job, args=(jobs[0],), daemon=True))
+            threads[0].start()
             while not list(here.rglob("metrics.csv")):
-                pass
+                threads[0].join(0.05)
             raise OSError("the pool is gone")
 
     monkeypatch.setattr(launchers, "run_basic", breaks)

@@ -52,11 +52,14 @@ _LOST = 255
 _TERMINATING = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 
 
-def run_in_process(job: Job) -> int:
-    """Run `job` in a child process and wait for it; returns its exit status, -N where signal N killed it.
+def run_in_process(job: Job) -> int | None:
+    """Run `job` in a child process and wait for it.
 
     The child leaves its result, or why it failed, in the run's folder. It also saves and stops when the calling process
     ends, even by SIGKILL.
+
+    Returns:
+        Its exit status, -N where signal N killed it; None where `stop_all` has ended it, in another thread.
     """
     # The fork server is a process of its own, which the system may kill for lack of memory. The attempt that meets a
     # dead one fails, the next starts another; if that fails as well, something else is wrong.
@@ -78,10 +81,11 @@ def run_in_process(job: Job) -> int:
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(process.pid, signal.SIGTERM)
     finally:
+        stopped = process not in _running
         # After an exception in this process the run may still be going: let it save first.
         _stop(process)
         ours.close()
-    return int(process.exitcode)
+    return None if stopped else int(process.exitcode)
 
 
 def _start(job: Job) -> tuple[Any, Connection]:
@@ -99,8 +103,8 @@ def _start(job: Job) -> tuple[Any, Connection]:
 
 def stop_all() -> None:
     """Ask every run that this process waits for to save and stop, and wait until they have."""
-    for process in tuple(_running):
-        _stop(process)
+    while _running:
+        _stop(_running.pop())
 
 
 def context_for(command: str) -> Any:
@@ -210,8 +214,8 @@ def run_job(job: Job) -> None:
         shown = f": AIHTR {value:,.3f}" if value is not None else ""
         if job.concurrent and not job.cfg.quiet:
             say(f"({job.label}) {job.name} done{shown}")
-    # One that ended without a word was stopped, unless nobody has asked the sweep to stop.
-    elif not stop_signal(job.sweep):
+    # One that ended without a word was stopped, unless nobody has asked it or the sweep to stop.
+    elif status is not None and not stop_signal(job.sweep):
         fail(job, _ended(status))
     remove_if_empty([job.folder])
 
