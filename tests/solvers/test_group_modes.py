@@ -115,6 +115,18 @@ def test_the_best_policy_of_revealed_modes_is_that_of_states(tmp_path: Path) -> 
         assert verify(reader).difference is None
 
 
+def test_plans_of_shown_modes_are_merged_alike_whatever_policies_may_remember() -> None:
+    """Where a detection tells all, the optimum reads nothing else, also in a task that lets it remember more."""
+    worlds = [ring(0.1, reveals=True, memory=memory) for memory in ("cell", "displacement")]
+    found = []
+    for world in worlds:
+        group = Group([world, world])
+        rule = group_rule(group, tm.solve(group).policy)
+        assert rule.name == "gains"
+        found.append(evaluate(group, rule, width=0.05).aihtr.mean)
+    assert found[0] == found[1]
+
+
 @pytest.mark.parametrize("memory", ["cell", "displacement"])
 def test_a_tracker_that_is_shown_modes_does_as_the_simulation(memory: str) -> None:
     """Plans are those of the states shown, and a detection leaves no doubt of the mode."""

@@ -210,7 +210,7 @@ class Merged(Rule):
         worths = [(list[IndexArray](), list[Array]()) for _ in range(self.task.num_choices)]
         # Plans are those of whole episodes, also where these are cut off.
         for kind, (world, table) in enumerate(zip(self.group.kinds, self.tables, strict=True)):
-            renewal = Renewal(world, world.motion)
+            renewal = Renewal(world.remembering(revealed=world.revealed), world.motion)
             try:
                 policy = Found(renewal, renewal.sets(table))
             except UserError as error:  # the target never exits
