@@ -170,17 +170,19 @@ def _of_all_runs(compose: Composer) -> Any:
         UserError: a word cannot be read, or has no effect on a sweep; or it gives several values to a setting of
             Hydra's own, of which a sweep has one.
     """
-    common = []
+    common, several = [], []
     for word in compose.words:
         if why := _OF_SINGLE_RUNS.get(key_of(word)):
             raise UserError(f"{word}: without effect, {why}")
         if not parsed(word).is_sweep_override():
             common.append(word)
-        elif not run_words([word]):
+        elif run_words([word]):
+            several.append(f"{key_of(word)}.")
+        else:
             raise UserError(f"{word}: expected one {word.partition('=')[0].split('/')[-1]}")
     # Hydra refuses words with several values outside its own multirun; options of the sweep as a whole have one
-    # value.
-    return compose(common)
+    # value. Of `algo=a2c,ppo algo.hidden=64` the default algorithm may not have the second option either.
+    return compose([word for word in common if not key_of(word).startswith(tuple(several))])
 
 
 def _plugin(part: str, node: DictConfig) -> Any:

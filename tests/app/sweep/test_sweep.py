@@ -94,6 +94,16 @@ def test_an_option_without_effect_is_told_with_resume_as_well(
     assert not list(here.iterdir())
 
 
+def test_an_option_of_the_choices_of_a_sweep_needs_not_be_one_of_the_default(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stub(monkeypatch, "train", lambda cfg, folder: 1.0)
+    assert swept("sensor=miss,footprint", "sensor.p_d=0.9") == 0
+    assert states(here / "all") == ["done", "done"]
+    assert swept("sensor=perfect,perfect", "sensor.p_d=0.9") == 2
+    assert "sensor.p_d: an option of another choice" in capsys.readouterr().err
+
+
 def test_a_mistake_in_one_run_is_told_and_the_others_go_on(
     here: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
