@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,6 +11,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+import trackmdp as tm
+from tests.helpers import small_world
 from trackmdp.durable import write_json, write_sealed
 from trackmdp.errors import UserError
 from trackmdp.reports import watch
@@ -57,6 +60,19 @@ def test_every_state_is_read_from_the_folder(tmp_path: Path) -> None:
         Status("d", "failed", reason="out of luck"),
         Status("e", "waiting"),
     ]
+
+
+def test_where_the_last_iteration_may_take_longest_the_time_left_is_the_least(
+    tmp_path: Path,
+) -> None:
+    place = begin(tmp_path / "a", "20,2000,30.0,4.0\n")
+    write_json(place / "plan.json", {"iterations": 100, "upper_bound": 50.0, "least": True})
+    with locked(place):
+        (status,) = statuses(tmp_path)
+    assert status.cells[-1] == "at least 16 s left"
+    few = {"total_frames": 64, "frames_per_batch": 64, "envs": 64}
+    tm.train(small_world(), "model_based", folder=tmp_path / "b", **few)
+    assert json.loads((tmp_path / "b/plan.json").read_text())["least"]
 
 
 def test_of_a_run_by_blocks_those_that_are_done_are_counted(tmp_path: Path) -> None:

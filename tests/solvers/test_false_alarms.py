@@ -265,6 +265,16 @@ def test_the_command_values_a_baseline_and_a_trained_policy(tmp_path: Path) -> N
     assert (told["p_f"], told["filter"]) == (0.02, None)
 
 
+@pytest.mark.parametrize("more", [[], ["grid.window=1"]])
+def test_the_table_has_a_filter_where_one_is_simulated(
+    more: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """In a window there is none: it is about the last located cell, and the filter is never sure of one."""
+    words = ["baseline=clocked", "sensor=false_alarm", "grid.size=3", "episodes=20", *more]
+    assert main(["evaluate", *words, f"hydra.run.dir={tmp_path / 'run'}"]) == 0
+    assert ("Bayes" in capsys.readouterr().out) != bool(more)
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [

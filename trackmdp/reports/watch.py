@@ -39,6 +39,7 @@ class Status:
         share: of its iterations, 0 to 1.
         gap: AIHTR missing to the upper bound, None while unknown.
         left: seconds to go, None while unknown.
+        least: whether the last iteration may take longer than all others.
         reason: of a failure.
     """
 
@@ -47,6 +48,7 @@ class Status:
     share: float = 0.0
     gap: float | None = None
     left: float | None = None
+    least: bool = False
     reason: str = ""
 
     @property
@@ -54,7 +56,9 @@ class Status:
         """Name, state or reason, progress, gap and time left as they are shown."""
         share = f"{100 * self.share:.0f} %" if self.state in ("running", "cut") else ""
         gap = "" if self.gap is None else f"gap {self.gap:,.2f}"
-        left = "" if self.left is None or self.state != "running" else f"{self.left:,.0f} s left"
+        left = ""
+        if self.left is not None and self.state == "running":
+            left = f"{'at least ' if self.least else ''}{self.left:,.0f} s left"
         reason = f": {self.reason}" if self.reason else ""
         return [printable(self.name), printable(f"{self.state}{reason}"), share, gap, left]
 
@@ -120,7 +124,8 @@ def _status(place: Path, name: str) -> Status:
     share = min(1.0, row["iteration"] / (_number(plan, "iterations") or math.inf))
     # As if every iteration took the same time.
     left = row["seconds"] * (1 - share) / share if share else None
-    return Status(name, found.state, share, _gap(row.get("aihtr"), bound), left)
+    least = bool(plan.get("least")) and share < 1
+    return Status(name, found.state, share, _gap(row.get("aihtr"), bound), left, least)
 
 
 def _gap(earned: float | None, *bounds: float | None) -> float | None:

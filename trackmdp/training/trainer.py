@@ -146,7 +146,11 @@ class Trainer(Training):
             (folder / SUMMARY).unlink(missing_ok=True)
             checkpoint.remove_later(folder / "checkpoints", self.start.iteration)
             write_inputs(config, problem, folder, resumed=state is not None)
-            plan = {"iterations": self.iterations, "upper_bound": self.evaluator.upper}
+            plan = {
+                "iterations": self.iterations,
+                "upper_bound": self.evaluator.upper,
+                "least": config.algo.plans_at_end,
+            }
             write_json(folder / "plan.json", plan)  # for `watch`
 
     def _restore(self, state: dict[str, Any] | None) -> Position:

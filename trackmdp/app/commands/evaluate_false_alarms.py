@@ -53,12 +53,15 @@ def evaluate_believed(
         "loss_per_step": loss,
     }
     write_json(folder / "evaluation.json", report)
-    rows = []
-    for key in ("aihtr", "accuracy", "sensors_per_step"):
-        played = with_interval(filtered[key], 4) if wanted else ""
-        rows.append([FIGURES[key], f"{noisy[key]:,.4f}", f"{plain[key]:,.4f}", played])
-    played = f"Bayes filter, {wanted} episodes, 95 %"
-    heads = ["figure", f"p_f = {sensor.p_f:g}, exact", "p_f = 0", played]
+    rows = [
+        [FIGURES[key], f"{noisy[key]:,.4f}", f"{plain[key]:,.4f}"]
+        for key in ("aihtr", "accuracy", "sensors_per_step")
+    ]
+    heads = ["figure", f"p_f = {sensor.p_f:g}, exact", "p_f = 0"]
+    if wanted:
+        heads.append(f"Bayes filter, {wanted} episodes, 95 %")
+        for row, key in zip(rows, ("aihtr", "accuracy", "sensors_per_step"), strict=True):
+            row.append(with_interval(filtered[key], 4))
     at.print(table(f"{subject}, each report taken for the truth", heads, rows))
     lost = f"{loss:.4f} a step lost to false alarms"
     at.print(f"upper bound (valid, of p_f = 0) {bound:,.4f}; {lost}; results in {folder}")
