@@ -316,11 +316,14 @@ def test_what_a_broken_launcher_left_undone_is_launched_again(
 
 @pytest.mark.slow
 def test_a_launcher_that_breaks_down_leaves_no_run_behind(
-    here: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Else it would go on without its sweep, which could not launch it again, and wait for it at its end."""
     from trackmdp.app.sweep import launchers
 
+    # With a fork server: where a thread of this process forks, `threading` may take another thread for the main one in
+    # the child (Python 3.11, beside a thread of torch's shared tensors), which then hears no signal.
+    monkeypatch.chdir(tmp_path)
     found, threads = [], []
 
     def breaks(cfg: Any, jobs: Any) -> None:
@@ -330,7 +333,7 @@ def test_a_launcher_that_breaks_down_leaves_no_run_behind(
         if not threads:
             threads.append(Thread(target=launchers.run_job, args=(jobs[0],), daemon=True))
             threads[0].start()
-            while not list(here.rglob("metrics.csv")):
+            while not list(tmp_path.rglob("metrics.csv")):
                 threads[0].join(0.05)
             raise OSError("the pool is gone")
 
