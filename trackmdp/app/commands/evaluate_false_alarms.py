@@ -53,16 +53,15 @@ def evaluate_believed(
         "loss_per_step": loss,
     }
     write_json(folder / "evaluation.json", report)
-    rows = [
-        [FIGURES[key], f"{noisy[key]:,.4f}", f"{plain[key]:,.4f}"]
-        for key in ("aihtr", "accuracy", "sensors_per_step")
-    ]
-    heads = ["figure", f"p_f = {sensor.p_f:g}, exact", "p_f = 0"]
+    keys = ("aihtr", "accuracy", "sensors_per_step")
+    columns = {"figure": [FIGURES[key] for key in keys]}
+    for head, found in ((f"p_f = {sensor.p_f:g}, exact", noisy), ("p_f = 0", plain)):
+        columns[head] = [f"{found[key]:,.4f}" for key in keys]
     if wanted:
-        heads.append(f"Bayes filter, {wanted} episodes, 95 %")
-        for row, key in zip(rows, ("aihtr", "accuracy", "sensors_per_step"), strict=True):
-            row.append(with_interval(filtered[key], 4))
-    at.print(table(f"{subject}, each report taken for the truth", heads, rows))
+        played = f"Bayes filter, {wanted} episodes, 95 %"
+        columns[played] = [with_interval(filtered[key], 4) for key in keys]
+    rows = [list(row) for row in zip(*columns.values(), strict=True)]
+    at.print(table(f"{subject}, each report taken for the truth", list(columns), rows))
     lost = f"{loss:.4f} a step lost to false alarms"
     at.print(f"upper bound (valid, of p_f = 0) {bound:,.4f}; {lost}; results in {folder}")
     return alarmed.aihtr
